@@ -1,0 +1,1 @@
+"""What crosses Facet's wire and lands in its logs."""
