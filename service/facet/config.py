@@ -1,0 +1,201 @@
+"""Settings of the shell: typed, with every default here; a file (TOML) only says what differs."""
+
+from __future__ import annotations
+
+import difflib
+import tomllib
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+
+MIB = 1 << 20
+Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+
+
+class ConfigError(ValueError):
+    """A setting that cannot be used; the message names the key, the value and what is allowed."""
+
+
+def is_loopback(endpoint: str) -> bool:
+    """Whether a Zenoh endpoint (`tcp/127.0.0.1:7447`) is reachable from this machine only."""
+    protocol, _, address = endpoint.partition("/")
+    if protocol.startswith("unix"):
+        return True
+    host = address.split("?")[0].split("#")[0].rpartition(":")[0].strip("[]")
+    return host == "localhost" or host == "::1" or host.startswith("127.")
+
+
+class Section(BaseModel):
+    """A table of the file: unknown keys are refused, values are fixed once loaded."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class MapSection(Section):
+    """Names: the map's own, and that of the frame its poses are given in."""
+
+    id: Id = "map"
+    frame: str = "map"
+
+
+class MappingSection(Section):
+    """What the method is told; None leaves the mapper's own default."""
+
+    voxel_m: float | None = Field(default=None, ge=0.005, le=1.0)  # m: resolution
+    theta_deg: float | None = Field(default=None, ge=1.0, le=45.0)  # thicker: no normal
+    detail_level: float | None = Field(default=None, ge=0.5, le=1.0)  # share of voxels on planes
+    reach_m: float | None = Field(default=None, ge=0.1, le=1000.0)  # m: reach of empty beams
+    min_range_m: float | None = Field(default=None, ge=0.0, le=1000.0)  # m
+    max_range_m: float | None = Field(default=None, gt=0.0, le=10000.0)  # m
+
+    def given(self) -> dict[str, float]:
+        """The values that were set, by name."""
+        return self.model_dump(exclude_none=True)
+
+
+class NetworkSection(Section):
+    """The Zenoh session: where it listens and connects, what it lets in."""
+
+    listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
+    connect: tuple[str, ...] = ()
+    max_message_bytes: int = Field(default=16 * MIB, ge=1024, le=1024 * MIB)
+    shared_memory: bool = True
+    root_ca_certificate: Path | None = None
+    listen_certificate: Path | None = None
+    listen_private_key: Path | None = None
+    mutual_tls: bool = False
+    users_file: Path | None = None  # lines "user:password"
+    access_control: Path | None = None  # JSON5 table of Zenoh's access_control
+
+    @model_validator(mode="after")
+    def _closed_to_strangers(self) -> NetworkSection:
+        for endpoint in self.listen:
+            if not is_loopback(endpoint) and not self._is_guarded(endpoint):
+                raise ValueError(
+                    f"{endpoint} is open to the network: anyone could put points into the map. "
+                    "Listen on 127.0.0.1, or use tls/ or quic/ with listen_certificate, "
+                    "listen_private_key and either mutual_tls or users_file"
+                )
+        return self
+
+    def _is_guarded(self, endpoint: str) -> bool:
+        encrypted = endpoint.startswith(("tls/", "quic/"))
+        has_keys = self.listen_certificate is not None and self.listen_private_key is not None
+        return encrypted and has_keys and (self.mutual_tls or self.users_file is not None)
+
+
+class QueueSection(Section):
+    """How much may wait between the network and the log; the oldest is shed, and counted."""
+
+    max_messages: int = Field(default=8192, ge=1, le=1_000_000)
+    max_bytes: int = Field(default=256 * MIB, ge=MIB, le=65536 * MIB)
+
+
+class RecordSection(Section):
+    """The log: what is not in it is not in the map."""
+
+    directory: Path = Path("out/log")
+    commit_ms: int = Field(default=50, ge=1, le=1000)
+    compression: Literal["lz4", "zstd", "none"] = "lz4"
+    max_file_bytes: int = Field(default=1024 * MIB, ge=MIB)
+    max_file_s: int = Field(default=3600, ge=1)
+    min_free_bytes: int = Field(default=256 * MIB, ge=0)
+    retry_s: float = Field(default=5.0, gt=0.0, le=600.0)
+    on_full: Literal["retry", "exit"] = "retry"
+
+
+class PublishSection(Section):
+    """What leaves over Zenoh."""
+
+    status_s: float = Field(default=1.0, gt=0.0, le=60.0)
+    points: bool = True
+    points_s: float = Field(default=0.5, gt=0.0, le=60.0)  # changed tiles, at most this often
+    queue: int = Field(default=64, ge=1, le=4096)  # updates; the oldest goes
+
+
+class Config(Section):
+    """Everything `facet run` can be told."""
+
+    map: MapSection = MapSection()
+    mapping: MappingSection = MappingSection()
+    network: NetworkSection = NetworkSection()
+    queue: QueueSection = QueueSection()
+    record: RecordSection = RecordSection()
+    publish: PublishSection = PublishSection()
+    viewer: str = "off"  # off | web | native | connect:URL
+
+    @field_validator("viewer")
+    @classmethod
+    def _known_viewer(cls, viewer: str) -> str:
+        if viewer in ("off", "web", "native") or viewer.startswith("connect:"):
+            return viewer
+        raise ValueError("must be off, web, native or connect:URL")
+
+
+def load_config(path: Path | None = None, overrides: dict[str, Any] | None = None) -> Config:
+    """The settings of a file, with `{"section.key": value}` on top; None values override nothing.
+
+    Raises ConfigError, also for a file that is not there or not TOML.
+    """
+    tree = _read_toml(path) if path is not None else {}
+    for dotted, value in (overrides or {}).items():
+        if value is not None:
+            _put(tree, dotted.split("."), value)
+    try:
+        return Config.model_validate(tree)
+    except ValidationError as error:
+        raise ConfigError("; ".join(_explain(e) for e in error.errors())) from None
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: {error.strerror}") from error
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: {error}") from error
+
+
+def _put(tree: dict[str, Any], keys: list[str], value: Any) -> None:
+    for key in keys[:-1]:
+        tree = tree.setdefault(key, {})
+    tree[keys[-1]] = value
+
+
+def _explain(error: Any) -> str:
+    """One line for one of pydantic's errors: key, value, and what would have been right."""
+    where = ".".join(str(part) for part in error["loc"])
+    if error["type"] == "extra_forbidden":
+        return f"unknown key {where}{_nearest(error['loc'])}"
+    if error["type"] == "value_error":
+        return f"{where}: {error['ctx']['error']}" if where else str(error["ctx"]["error"])
+    return f"{where} = {error['input']!r}: {error['msg'][:1].lower()}{error['msg'][1:]}{_range(error['loc'])}"
+
+
+def _section(loc: tuple[Any, ...]) -> type[BaseModel]:
+    model: type[BaseModel] = Config
+    for part in loc[:-1]:
+        field = model.model_fields.get(str(part))
+        annotation = field.annotation if field else None
+        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
+            model = annotation
+    return model
+
+
+def _nearest(loc: tuple[Any, ...]) -> str:
+    known = list(_section(loc).model_fields)
+    near = difflib.get_close_matches(str(loc[-1]), known, n=1, cutoff=0.0)
+    return f"; did you mean {'.'.join([*map(str, loc[:-1]), near[0]])}?" if near else ""
+
+
+def _range(loc: tuple[Any, ...]) -> str:
+    field = _section(loc).model_fields.get(str(loc[-1]))
+    signs = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
+    limits = [
+        f"{sign} {getattr(constraint, name)}"
+        for constraint in (field.metadata if field else [])
+        for name, sign in signs.items()
+        if hasattr(constraint, name)
+    ]
+    return f" (allowed: {' and '.join(limits)})" if limits else ""
