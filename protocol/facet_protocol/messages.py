@@ -1,4 +1,4 @@
-"""The values that cross Facet's boundaries: scans in, planes and updates out. No wire format here."""
+"""The values that cross Facet's boundaries: scans in, planes and updates out. No wire format."""
 
 from __future__ import annotations
 
@@ -259,7 +259,7 @@ class MapUpdate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TilePoints:
-    """The voxels of one tile (64 voxels a side), for display. Empty arrays: the tile is empty now."""
+    """The voxels of one tile (64 a side), for display. Empty arrays: the tile is empty now."""
 
     tile: tuple[int, int, int]
     voxel_m: float
@@ -293,9 +293,15 @@ class Status:
     revision: int
     stamp_ns: int
     health: str  # "OK" | "DEGRADED" | "FAIL"
-    counters: dict[str, int] = field(default_factory=dict)  # received, recorded, applied, rejected.<reason>, ...
-    gauges: dict[str, float] = field(default_factory=dict)  # queue_msgs, queue_bytes, voxels, planes, rss_mb, ...
-    stage_ms: dict[str, float] = field(default_factory=dict)  # insert, normals, patches, planes, contours, ...
+    counters: dict[str, int] = field(
+        default_factory=dict
+    )  # received, recorded, applied, rejected.<reason>, ...
+    gauges: dict[str, float] = field(
+        default_factory=dict
+    )  # queue_msgs, queue_bytes, voxels, planes, rss_mb, ...
+    stage_ms: dict[str, float] = field(
+        default_factory=dict
+    )  # insert, normals, patches, planes, contours, ...
 
 
 @dataclass(frozen=True, slots=True, eq=False)

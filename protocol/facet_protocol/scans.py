@@ -1,0 +1,165 @@
+"""Scans both ways: foxglove.PointCloud and foxglove.LaserScan, with the sensor's pose inside."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from foxglove_schemas_protobuf.LaserScan_pb2 import LaserScan
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+
+from facet_protocol.cloud import DATA_FIELD, pack_points, read_layout, read_points, split_beams
+from facet_protocol.messages import Envelope, LineFan, Pose, ProtocolError, Scan, ScanKind
+from facet_protocol.poses import pose_message, pose_of
+from facet_protocol.projection import MAX_ANGLE, count_ignored, project_fan
+from facet_protocol.wire import parse, split_bytes_field, stamp_of, timestamp_of
+
+CLOUD_SCHEMA = "foxglove.PointCloud"
+FAN_SCHEMA = "foxglove.LaserScan"
+SCAN_SCHEMAS = (CLOUD_SCHEMA, FAN_SCHEMA)
+REACH_M = 8.0  # how far a line beam that came back empty counts as free, unless the map says so
+
+_IDENTITY = Pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+
+
+class _Head(NamedTuple):
+    stamp_ns: int
+    frame_id: str
+    pose: Pose
+    renormalised: bool
+
+
+def _head(
+    message: PointCloud | LaserScan, envelope: Envelope, frame_id: str | None, pose_required: bool
+) -> _Head:
+    """Stamp, frame and pose, checked; the stamp is the envelope's where the message has none."""
+    if frame_id is not None and message.frame_id != frame_id:
+        text = f"frame_id is {message.frame_id[:80]!r}, expected {frame_id!r}"
+        raise ProtocolError(f"{envelope.schema}: {text}", "wrong_frame")
+    has_stamp = message.HasField("timestamp")
+    stamp_ns = stamp_of(message.timestamp) if has_stamp else envelope.stamp_ns
+    if message.HasField("pose"):
+        return _Head(stamp_ns, message.frame_id, *pose_of(message.pose))
+    if pose_required:
+        raise ProtocolError(f"{envelope.schema}: no pose", "bad_pose")
+    return _Head(stamp_ns, message.frame_id, _IDENTITY, False)
+
+
+def decode_scan(
+    envelope: Envelope,
+    robot: str,
+    sensor: str,
+    reach_m: float = REACH_M,
+    *,
+    frame_id: str | None = None,
+    pose_required: bool = True,
+) -> Scan:
+    """The scan in `envelope`; its points may be a view of the payload (see `read_points`).
+
+    Raises ProtocolError: malformed, bad_layout, bad_pose, bad_quaternion, bad_stamp, wrong_frame
+    (when `frame_id` is given and differs), unknown_schema. With `pose_required` False a scan
+    without a pose is taken at its own frame's origin, for a caller that will place it.
+    """
+    if envelope.schema == CLOUD_SCHEMA:
+        return _decode_cloud(envelope, robot, sensor, frame_id, pose_required)
+    if envelope.schema == FAN_SCHEMA:
+        fan, renormalised = _decode_fan(envelope, robot, sensor, frame_id, pose_required)
+        return project(fan, reach_m, renormalised)
+    raise ProtocolError(f"{envelope.schema[:80]!r} is not the schema of a scan", "unknown_schema")
+
+
+def _decode_cloud(
+    envelope: Envelope, robot: str, sensor: str, frame_id: str | None, pose_required: bool
+) -> Scan:
+    message, data = split_bytes_field(PointCloud, envelope.payload, DATA_FIELD)
+    head = _head(message, envelope, frame_id, pose_required)
+    layout = read_layout(message, len(data))
+    points, no_return = split_beams(layout, data, read_points(layout, data))
+    return Scan(
+        robot=robot,
+        sensor=sensor,
+        epoch=envelope.epoch,
+        sequence=envelope.sequence,
+        stamp_ns=head.stamp_ns,
+        frame_id=head.frame_id,
+        kind=ScanKind.CLOUD,
+        pose=head.pose,
+        points=points,
+        no_return=no_return,
+        renormalised=head.renormalised,
+    )
+
+
+def _decode_fan(
+    envelope: Envelope, robot: str, sensor: str, frame_id: str | None, pose_required: bool
+) -> tuple[LineFan, bool]:
+    message = parse(LaserScan, envelope.payload)
+    head = _head(message, envelope, frame_id, pose_required)
+    start, end = message.start_angle, message.end_angle
+    if not (abs(start) <= MAX_ANGLE and abs(end) <= MAX_ANGLE):
+        raise ProtocolError(f"foxglove.LaserScan: angles {start} to {end} rad", "bad_layout")
+    fan = LineFan(
+        robot=robot,
+        sensor=sensor,
+        epoch=envelope.epoch,
+        sequence=envelope.sequence,
+        stamp_ns=head.stamp_ns,
+        frame_id=head.frame_id,
+        pose=head.pose,
+        start_angle=start,
+        end_angle=end,
+        ranges=np.fromiter(message.ranges, np.float64, len(message.ranges)),
+    )
+    return fan, head.renormalised
+
+
+def project(fan: LineFan, reach_m: float = REACH_M, renormalised: bool = False) -> Scan:
+    """The fan as points in the sensor's x-y plane."""
+    points, no_return = project_fan(fan.start_angle, fan.end_angle, fan.ranges, reach_m)
+    return Scan(
+        robot=fan.robot,
+        sensor=fan.sensor,
+        epoch=fan.epoch,
+        sequence=fan.sequence,
+        stamp_ns=fan.stamp_ns,
+        frame_id=fan.frame_id,
+        kind=ScanKind.LINE,
+        pose=fan.pose,
+        points=points,
+        no_return=no_return,
+        ignored=count_ignored(fan.ranges),
+        renormalised=renormalised,
+    )
+
+
+def encode_cloud(scan: Scan) -> bytes:
+    """foxglove.PointCloud. A projected line scan has no way back: encode its LineFan instead."""
+    if scan.kind is not ScanKind.CLOUD:
+        raise ProtocolError("a line scan is encoded from its LineFan", "unknown_schema")
+    stride, fields, data = pack_points(scan.points, scan.no_return)
+    return PointCloud(
+        timestamp=timestamp_of(scan.stamp_ns),
+        frame_id=scan.frame_id,
+        pose=pose_message(scan.pose),
+        point_stride=stride,
+        fields=fields,
+        data=data,
+    ).SerializeToString(deterministic=True)
+
+
+def encode_fan(fan: LineFan) -> bytes:
+    return LaserScan(
+        timestamp=timestamp_of(fan.stamp_ns),
+        frame_id=fan.frame_id,
+        pose=pose_message(fan.pose),
+        start_angle=float(fan.start_angle),
+        end_angle=float(fan.end_angle),
+        ranges=np.asarray(fan.ranges, dtype=np.float64).tolist(),
+    ).SerializeToString(deterministic=True)
+
+
+def encode_scan(scan: Scan | LineFan) -> tuple[str, bytes]:
+    """(schema, payload)."""
+    if isinstance(scan, LineFan):
+        return FAN_SCHEMA, encode_fan(scan)
+    return CLOUD_SCHEMA, encode_cloud(scan)

@@ -1,0 +1,135 @@
+"""Protobuf at the byte level: parsing that fails with ProtocolError alone, zero-copy fields."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import TypeVar
+
+import numpy as np
+from google.protobuf.message import DecodeError, Message
+from google.protobuf.timestamp_pb2 import Timestamp
+from numpy.typing import NDArray
+
+from facet_protocol.messages import Pose, ProtocolError
+
+M = TypeVar("M", bound=Message)
+
+MAX_TOP_FIELDS = 512  # more top-level fields than any message of ours has: a bound on the walk
+NORM_TOLERANCE = 1e-3  # a quaternion further off is refused: 1 % is 20 cm at 10 m
+_EXACT_NORM = 4e-15  # within rounding of 1: kept, so that encode(decode(x)) keeps its bits
+
+_VARINT, _FIXED64, _BYTES, _FIXED32 = 0, 1, 2, 5
+
+
+def parse(message_type: type[M], payload: bytes | memoryview) -> M:
+    """The message in `payload`. An empty payload would parse as an empty message: refused."""
+    name = message_type.DESCRIPTOR.full_name
+    if len(payload) == 0:
+        raise ProtocolError(f"{name}: empty payload")
+    try:
+        return message_type.FromString(payload)  # type: ignore[arg-type]  # takes buffers too
+    except DecodeError as error:
+        raise ProtocolError(f"{name}: {error} ({len(payload)} bytes)") from error
+
+
+def _varint(data: memoryview, position: int) -> tuple[int, int]:
+    value = 0
+    for shift in range(0, 70, 7):
+        if position >= len(data):
+            raise ProtocolError(f"varint cut off at byte {position} of {len(data)}")
+        byte = data[position]
+        position += 1
+        value |= (byte & 0x7F) << shift
+        if byte < 0x80:
+            return value, position
+    raise ProtocolError(f"varint longer than 10 bytes before byte {position}")
+
+
+def _skip(data: memoryview, position: int, wire_type: int) -> int:
+    """Position after a value that starts at `position`."""
+    if wire_type == _VARINT:
+        return _varint(data, position)[1]
+    if wire_type == _FIXED64:
+        return position + 8
+    if wire_type == _FIXED32:
+        return position + 4
+    if wire_type == _BYTES:
+        length, position = _varint(data, position)
+        return position + length
+    raise ProtocolError(f"wire type {wire_type} at byte {position}")
+
+
+def split_bytes_field(
+    message_type: type[M], payload: bytes | memoryview, number: int
+) -> tuple[M, memoryview]:
+    """The message without bytes field `number`, and a view of that field's bytes in `payload`.
+
+    Walks the top-level fields only; nothing of the field is copied. The last occurrence counts.
+    """
+    data = memoryview(payload).cast("B")
+    position, field = 0, memoryview(b"")
+    rest: list[memoryview] = []
+    for _ in range(MAX_TOP_FIELDS):
+        if position >= len(data):
+            break
+        start = position
+        tag, position = _varint(data, position)
+        begin, position = position, _skip(data, position, tag & 7)
+        if position > len(data):
+            raise ProtocolError(f"field {tag >> 3} ends at byte {position} of {len(data)}")
+        if tag == (number << 3) | _BYTES:
+            length, begin = _varint(data, begin)
+            field = data[begin : begin + length]
+        else:
+            rest.append(data[start:position])
+    else:
+        if position < len(data):
+            raise ProtocolError(f"more than {MAX_TOP_FIELDS} fields")
+    return parse(message_type, b"".join(rest)), field
+
+
+def finite(values: Iterable[float], num: int, name: str) -> NDArray[np.float64]:
+    """(num,) float64. Raises ProtocolError when there are not `num`, or one is not finite."""
+    array = np.array(list(values), dtype=np.float64)
+    if array.size != num:
+        raise ProtocolError(f"{name}: {array.size} numbers, expected {num}")
+    if not all(map(math.isfinite, array.tolist())):
+        raise ProtocolError(f"{name}: {array.tolist()} is not finite")
+    return array
+
+
+def check_pose(position: Iterable[float], orientation_xyzw: Iterable[float]) -> tuple[Pose, bool]:
+    """A pose with a unit quaternion, and whether it had to be renormalised by more than 1e-9.
+
+    Raises ProtocolError: bad_pose when something is not finite, bad_quaternion when the norm is off
+    by more than NORM_TOLERANCE. By + * / sqrt alone: the same bits on every machine.
+    """
+    p = np.array(list(position), dtype=np.float64)
+    q = [float(c) for c in orientation_xyzw]
+    if p.size != 3 or len(q) != 4:
+        raise ProtocolError(f"pose of {p.size} + {len(q)} numbers, expected 3 + 4", "bad_pose")
+    if not all(map(math.isfinite, [*p.tolist(), *q])):
+        raise ProtocolError(f"pose {p.tolist()} {q} is not finite", "bad_pose")
+    square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
+    norm = math.sqrt(square)
+    if not abs(norm - 1.0) <= NORM_TOLERANCE:
+        raise ProtocolError(f"quaternion {q} has norm {norm:.6g}", "bad_quaternion")
+    if abs(square - 1.0) <= _EXACT_NORM:
+        return Pose(p, np.array(q)), False
+    return Pose(p, np.array([c / norm for c in q])), abs(norm - 1.0) > 1e-9
+
+
+def stamp_of(timestamp: Timestamp) -> int:
+    """int64 ns since the Unix epoch. Raises ProtocolError (bad_stamp) when it is not one."""
+    if not 0 <= timestamp.nanos < 1_000_000_000:
+        raise ProtocolError(f"stamp has {timestamp.nanos} nanoseconds", "bad_stamp")
+    stamp_ns = timestamp.seconds * 1_000_000_000 + timestamp.nanos
+    if not -(2**63) <= stamp_ns < 2**63:
+        raise ProtocolError(f"stamp of {timestamp.seconds} s does not fit 64 bits", "bad_stamp")
+    return stamp_ns
+
+
+def timestamp_of(stamp_ns: int) -> Timestamp:
+    seconds, nanos = divmod(int(stamp_ns), 1_000_000_000)
+    return Timestamp(seconds=seconds, nanos=nanos)
