@@ -1,0 +1,1 @@
+"""The model in other programs' formats: `formats.FORMATS`. Nothing here changes a map."""
