@@ -170,7 +170,8 @@ def _explain(error: Any) -> str:
         return f"unknown key {where}{_nearest(error['loc'])}"
     if error["type"] == "value_error":
         return f"{where}: {error['ctx']['error']}" if where else str(error["ctx"]["error"])
-    return f"{where} = {error['input']!r}: {error['msg'][:1].lower()}{error['msg'][1:]}{_range(error['loc'])}"
+    text = error["msg"][:1].lower() + error["msg"][1:]
+    return f"{where} = {error['input']!r}: {text}{_range(error['loc'])}"
 
 
 def _section(loc: tuple[Any, ...]) -> type[BaseModel]:

@@ -4,16 +4,15 @@ from __future__ import annotations
 
 from typing import Protocol
 
-from facet_protocol.messages import Cut, Envelope, MapUpdate, Scan, Status, TilePoints
-
-Message = Scan | MapUpdate | TilePoints | Status | Cut
+from facet_protocol.codec import Message
+from facet_protocol.messages import Envelope
 
 
 class Sink(Protocol):
     """Sees every message once, in order, with the bytes it travels as."""
 
-    def write(self, envelope: Envelope, message: Message) -> None:
-        """Take one message; must not keep a reference to arrays it means to change."""
+    def write(self, envelope: Envelope, message: Message | None) -> None:
+        """Take one message; None where only the bytes are known (a scan not decoded yet)."""
         ...
 
     def close(self) -> None:

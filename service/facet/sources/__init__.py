@@ -1,1 +1,1 @@
-"""Where messages come from: Zenoh (live) and MCAP (recording). A source is an iterable of envelopes."""
+"""Where messages come from: Zenoh (live) and MCAP (recording). A source gives envelopes."""
