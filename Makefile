@@ -1,0 +1,51 @@
+# One command checks everything, here and in CI: make test
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/.installed
+PROTO := protocol/facet_protocol/proto
+
+.PHONY: setup demo test format lint types unit bench soak proto recordings clean
+
+setup: $(STAMP)
+
+$(STAMP): pyproject.toml
+	test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[test]'
+	touch $@
+
+demo: $(STAMP) ## a simulated robot drives through a building; the map comes out
+	$(BIN)/python -m facet demo
+
+test: lint types unit ## everything a change must pass
+
+lint: $(STAMP)
+	$(BIN)/ruff format --check .
+	$(BIN)/ruff check .
+
+format: $(STAMP)
+	$(BIN)/ruff format .
+	$(BIN)/ruff check --fix .
+
+types: $(STAMP)
+	$(BIN)/mypy
+
+unit: $(STAMP)
+	RERUN_STRICT=1 $(BIN)/python -m pytest -m 'not slow'
+
+bench: $(STAMP) ## figures, not verdicts
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e '.[bench]'
+	for bench in tests/bench/bench_*.py; do PYTHONPATH=tests $(BIN)/python $$bench || exit 1; done
+
+soak: $(STAMP) ## the long tests
+	RERUN_STRICT=1 $(BIN)/python -m pytest -m slow --timeout 3600
+
+proto: $(STAMP) ## facet/v1 again, after a change to a .proto file
+	$(BIN)/python -m grpc_tools.protoc -Iprotocol --python_out=protocol --pyi_out=protocol $(PROTO)/*.proto
+
+recordings: $(STAMP) ## the committed recordings again, from their seeds
+	$(BIN)/python tests/make_recordings.py recordings
+
+clean:
+	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist out
+	find service protocol tests -name __pycache__ -type d -exec rm -rf {} +
