@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import re
 
 from facet.sequences import SequenceLedger
+from facet.sources.naming import robot_and_sensor, source_of
 from facet.status import Account
 from facet_protocol.messages import Envelope, ProtocolError, Scan
 from facet_protocol.scans import decode_scan
-from facet_protocol.topics import parse_scan_key
-
-FOREIGN_ROBOT = "recording"  # who drove, where the topic does not say
 
 
 class Admission:
@@ -40,7 +37,7 @@ class Admission:
         return scan
 
     def _decode(self, envelope: Envelope) -> Scan:
-        robot, sensor = source_of(envelope.key).split("/")
+        robot, sensor = robot_and_sensor(envelope.key)
         return decode_scan(envelope, robot, sensor, self._reach_m, frame_id=self._frame_id)
 
     def _is_first(self, envelope: Envelope, source: str) -> bool:
@@ -52,13 +49,3 @@ class Admission:
         known = digest.digest() in self._unnumbered
         self._unnumbered.add(digest.digest())
         return not known
-
-
-def source_of(key: str) -> str:
-    """ "robot/sensor" of a scan's key; of a topic from elsewhere, a name made of the topic."""
-    try:
-        names = parse_scan_key(key)
-    except ProtocolError:
-        sensor = re.sub(r"[^A-Za-z0-9_-]+", "_", key).strip("_")[:64] or "scan"
-        return f"{FOREIGN_ROBOT}/{sensor}"
-    return f"{names.robot}/{names.sensor}"
