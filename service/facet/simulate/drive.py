@@ -13,10 +13,10 @@ _STEP_M = 0.01
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Drive:
-    """Waypoints joined by straight lines, then smoothed by a Gaussian of `smooth_m` along the way."""
+    """Waypoints joined by straight lines, then smoothed along the way by a Gaussian."""
 
     waypoints: Float  # (K, 3) m, world, on the floor
-    smooth_m: float = 0.25
+    smooth_m: float = 0.25  # its standard deviation
 
     def moved(self, R_world_scene: Float, shift: Float) -> Drive:
         return Drive(self.waypoints @ R_world_scene.T + shift, self.smooth_m)

@@ -1,4 +1,4 @@
-"""Scans of a scene along its drive: casts the beams, adds the noise. The same seed, the same scans."""
+"""Scans of a scene along its drive: beams cast, noise added. The same seed, the same scans."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Simulation:
         sensor: str | Sensor,
         *,
         seed: int = 0,
-        noise: Noise = Noise(),  # noqa: B008 frozen
+        noise: Noise = Noise(),
         num_scans: int | None = None,
         max_points: int | None = None,
         duration_s: float | None = None,

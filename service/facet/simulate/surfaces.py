@@ -1,4 +1,4 @@
-"""Bounded planar polygons with holes, and the builders of walls, boxes and rooms. No sensors here."""
+"""Bounded planar polygons with holes, and the builders of walls, boxes and rooms. No sensors."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ UP = (0.0, 0.0, 1.0)
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """A rectangle left out of a wall: `what`, its extent along the wall's axis (x or y) and in z, m.
+    """A rectangle left out of a wall: its extent along the wall's axis (x or y) and in z, m.
 
-    `what`: "door" and "window" let beams through, "glass" returns nothing, "recess" has a face behind.
+    "door" and "window" let beams through, "glass" returns nothing, "recess" has a face behind.
     """
 
     what: str
@@ -210,7 +210,7 @@ def box(
 def reveal(
     name: str, x: tuple[float, float], y: tuple[float, float], top: float, *, through: str
 ) -> list[TruthSurface]:
-    """Jambs and lintel of a passage through a solid wall that fills x, y; `through` is "x" or "y"."""
+    """Jambs and lintel of a passage along `through` ("x" or "y") in a wall that fills x, y."""
     if through == "y":
         jambs = [
             wall(f"{name} jamb low", (x[0], y[0]), (x[0], y[1]), (0.0, top)),
