@@ -82,6 +82,8 @@ def _check_axes(columns: Mapping[str, Column]) -> None:
 def read_column(layout: Layout, data: memoryview, name: str) -> NDArray[np.generic]:
     """(N,) view of one field in `data`."""
     column = layout.columns[name]
+    if layout.num_points == 0:  # an offset into no bytes is an error to numpy
+        return np.empty(0, dtype=column.dtype)
     return np.ndarray(
         (layout.num_points,), column.dtype, data, column.offset, (layout.point_stride,)
     )
