@@ -56,7 +56,7 @@ LAYERS = {  # the longest name that fits counts
     "facet.session": Layer("facet.config", "zenoh"),
     "facet": SHELL,
     "facet.intake": WIRING,
-    "facet.service": WIRING,
+    "facet.service": Layer(f"{WIRING.ours} facet.export.*", "numpy zenoh"),
     "facet.commands": EVERYTHING,
     "facet.__main__": EVERYTHING,
 }
