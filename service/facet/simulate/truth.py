@@ -172,13 +172,17 @@ def cells_in_ring(
     ring: Float, corner: tuple[float, float], shape: tuple[int, ...]
 ) -> NDArray[np.bool_]:
     """Which cell centres of a raster (rows, columns) lie in `ring` (M, 2) m: even-odd rule."""
-    v = corner[1] + (np.arange(shape[0])[:, None] + 0.5) * CELL_M
-    u = corner[0] + (np.arange(shape[1])[None, :] + 0.5) * CELL_M
-    inside = np.zeros(shape, dtype=np.bool_)
-    for (u0, v0), (u1, v1) in zip(ring, np.roll(ring, -1, axis=0), strict=True):
-        if v0 != v1:
-            inside ^= ((v0 > v) != (v1 > v)) & (u < (u1 - u0) * (v - v0) / (v1 - v0) + u0)
-    return inside
+    rows, columns = shape
+    v = corner[1] + (np.arange(rows) + 0.5) * CELL_M
+    (u0, v0), (u1, v1) = ring.T[:, :, None], np.roll(ring, -1, axis=0).T[:, :, None]
+    edge, row = np.nonzero((v0 > v) != (v1 > v))  # each crossing flips all cells to its left
+    slope = (u1 - u0)[edge, 0] / (v1 - v0)[edge, 0]
+    u = u0[edge, 0] + slope * (v[row] - v0[edge, 0])
+    left = np.clip(np.ceil((u - corner[0]) / CELL_M - 0.5), 0, columns).astype(np.int64)
+    flips = np.zeros((rows, columns + 1), dtype=np.int64)
+    np.add.at(flips, (row, left), 1)
+    to_the_right = np.cumsum(flips[:, ::-1], axis=1)[:, ::-1]
+    return np.asarray(to_the_right[:, 1:] % 2 == 1)
 
 
 def grown(mask: NDArray[np.bool_], cells: int) -> NDArray[np.bool_]:
