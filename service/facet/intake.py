@@ -1,0 +1,223 @@
+"""From the door to the log to the mapper: what is recorded, and only that, is handed on."""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+
+from facet.outgoing import Outgoing
+from facet.sequences import SequenceLedger
+from facet.sinks import Message
+from facet.sinks.recorder import Recorder
+from facet.sources.live import Inbox, loss_of
+from facet.sources.naming import source_of
+from facet.status import Account
+from facet_protocol.messages import Envelope, Loss, Scan, TilePoints
+
+logger = logging.getLogger(__name__)
+
+BATCH_BYTES = 8 << 20  # a commit is due after this much, whatever the clock says
+MAX_DERIVED = 4096  # messages of our own that wait for the log
+
+
+class DurableQueue:
+    """Scans that are in the log and wait for the mapper, bounded by bytes."""
+
+    def __init__(self, max_bytes: int) -> None:
+        self._max_bytes = max_bytes
+        self._num_bytes = 0
+        self._waiting: deque[Envelope] = deque()
+        self._changed = threading.Condition()
+        self._closed = False
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    @property
+    def has_room(self) -> bool:
+        return self._num_bytes < self._max_bytes
+
+    def put(self, envelopes: list[Envelope]) -> None:
+        with self._changed:
+            self._waiting.extend(envelopes)
+            self._num_bytes += sum(len(e.payload) for e in envelopes)
+            self._changed.notify_all()
+
+    def take(self, timeout_s: float) -> list[Envelope]:
+        """All that wait, in log order."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._waiting or self._closed, timeout_s)
+            taken = list(self._waiting)
+            self._waiting.clear()
+            self._num_bytes = 0
+            self._changed.notify_all()
+        return taken
+
+    def wait_for_room(self, timeout_s: float) -> bool:
+        with self._changed:
+            return self._changed.wait_for(lambda: self.has_room, timeout_s)
+
+    def close(self) -> None:
+        """No one waits any longer; what is in it can still be taken."""
+        with self._changed:
+            self._closed = True
+            self._changed.notify_all()
+
+
+class Intake:
+    """The recorder's thread. As a sink it takes what the pipeline says, for the same log.
+
+    When the disk fails: health is FAIL, nothing is handed on, and it is tried again every
+    `retry_s`, or the service ends (`exit_on_failure`).
+    """
+
+    def __init__(
+        self,
+        inbox: Inbox,
+        recorder: Recorder,
+        durable: DurableQueue,
+        outgoing: Outgoing,
+        account: Account,
+        *,
+        commit_s: float = 0.05,
+        retry_s: float = 5.0,
+        exit_on_failure: bool = False,
+    ) -> None:
+        self._inbox, self._recorder, self._durable = inbox, recorder, durable
+        self._outgoing, self._account = outgoing, account
+        self._commit_s, self._retry_s = commit_s, retry_s
+        self._exit_on_failure = exit_on_failure
+        self._ledger = SequenceLedger()
+        self._derived: deque[Envelope] = deque()
+        self._scans: list[Envelope] = []  # written, not yet durable
+        self._stopping = threading.Event()
+        self._roll = threading.Event()
+        self.failed = threading.Event()  # the disk failed and `exit_on_failure` says to end
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def write(self, envelope: Envelope, message: Message | None) -> None:
+        """Queue one of our own messages for the log; scans are in it already."""
+        if isinstance(message, Scan | TilePoints):
+            return
+        if len(self._derived) >= MAX_DERIVED:
+            self._derived.popleft()
+            self._account.count("log_dropped")
+        self._derived.append(envelope)
+
+    def close(self) -> None:
+        """Nothing: the log is finished by `stop`, after the last message of every thread."""
+
+    def roll(self) -> None:
+        """Start a new file at the next commit."""
+        self._roll.set()
+
+    def drain(self, timeout_s: float) -> None:
+        """Wait until what has come in is durable and handed on, or the time is up."""
+        deadline = time.monotonic() + timeout_s
+        while (len(self._inbox) or self._scans) and time.monotonic() < deadline:
+            time.sleep(0.005)
+
+    def stop(self, timeout_s: float) -> None:
+        """Record what is left and finish the file."""
+        self._stopping.set()
+        self._inbox.wake()
+        self._thread.join(timeout_s)
+
+    def _run(self) -> None:
+        due = time.monotonic() + self._commit_s
+        while not self._stopping.is_set():
+            if not self._account.failure and self._durable.wait_for_room(self._commit_s):
+                self._take(max(0.0, due - time.monotonic()))
+            if time.monotonic() >= due or self._num_bytes() >= BATCH_BYTES:
+                self._commit()
+                due = time.monotonic() + self._commit_s
+        self._take(0.0)
+        self._finish()
+
+    def _num_bytes(self) -> int:
+        return sum(len(envelope.payload) for envelope in self._scans)
+
+    def _take(self, timeout_s: float) -> None:
+        """From the inbox and from ourselves into the recorder, counted."""
+        for envelope in self._inbox.take(timeout_s, BATCH_BYTES):
+            for loss in self._inbox.take_shed():
+                self._lose(loss)
+            self._note(envelope)
+            self._recorder.write(envelope)
+            self._scans.append(envelope)
+        while self._derived:
+            self._recorder.write(self._derived.popleft())
+
+    def _note(self, envelope: Envelope) -> None:
+        """Count one message that came, and what is missing right before it."""
+        source = source_of(envelope.key)
+        self._account.count("received", source)
+        _, skipped = self._ledger.note(source, envelope.epoch, envelope.sequence)
+        if skipped:
+            first = envelope.sequence - skipped
+            self._log_loss(loss_of(envelope, first, skipped, "lost_upstream"))
+        self._account.set_counter("lost_upstream", sum(self._ledger.missing().values()))
+
+    def _lose(self, loss: Loss) -> None:
+        """What the inbox had to drop did arrive: it is no loss upstream."""
+        source = f"{loss.robot}/{loss.sensor}"
+        self._account.count("received", source, loss.count)
+        self._account.count(loss.reason, source, loss.count)
+        if loss.first_sequence:
+            for sequence in range(loss.first_sequence, loss.first_sequence + loss.count):
+                self._ledger.note(source, loss.epoch, sequence)
+        self._log_loss(loss)
+
+    def _log_loss(self, loss: Loss) -> None:
+        envelope, _ = self._outgoing.loss(loss)
+        self._recorder.write(envelope)
+        text = f"{loss.count} scans from sequence {loss.first_sequence}"
+        self._account.complain(f"{loss.robot}/{loss.sensor}", loss.reason, text)
+
+    def _commit(self) -> None:
+        """Make it durable and hand it on; on a failing disk wait, and keep it."""
+        started = time.monotonic()
+        try:
+            if self._roll.is_set():
+                self._roll.clear()
+                self._recorder.commit()
+                self._recorder.roll()
+            self._recorder.commit()
+        except OSError as error:
+            self._fail(error)
+            return
+        if self._account.failure:
+            logger.warning("the log is being written again")
+            self._account.failure = ""
+        self._account.gauge("commit_ms", (time.monotonic() - started) * 1e3)
+        self._hand_on()
+
+    def _hand_on(self) -> None:
+        scans, self._scans = self._scans, []
+        for envelope in scans:
+            self._account.count("recorded", source_of(envelope.key))
+        if scans:
+            self._durable.put(scans)
+
+    def _fail(self, error: OSError) -> None:
+        self._account.failure = str(error)
+        self._account.count("recorder_failed")
+        logger.error("the log cannot be written, nothing is mapped: %s", error)
+        if self._exit_on_failure:
+            self.failed.set()
+        self._stopping.wait(self._retry_s)
+
+    def _finish(self) -> None:
+        try:
+            self._recorder.close()
+            self._hand_on()
+        except OSError as error:
+            lost = self._recorder.forget()
+            self._account.failure = str(error)
+            self._account.count("unrecorded", num=len(self._scans))
+            logger.error("%d messages could not be recorded: %s", len(lost), error)

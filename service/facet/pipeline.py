@@ -1,0 +1,141 @@
+"""The line: a message in, the map updated, messages out. One thread owns it, and so the map."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+
+from facet.admission import Admission
+from facet.mapping.mapper import Mapper
+from facet.outgoing import Outgoing
+from facet.sinks import Message, Sink
+from facet.status import Account
+from facet_protocol.messages import Cut, Envelope, MapUpdate, Scan
+
+Tile = tuple[int, int, int]
+
+
+@dataclass(slots=True)
+class Applied:
+    """The last scan of a source that is in the map, and how many came since the last cut."""
+
+    envelope: Envelope
+    scan: Scan
+    num_scans: int
+
+
+class Pipeline:
+    """Applies scans and derives updates; every sink sees every message once, in order.
+
+    Who fails how: a bad message is counted and left out (`Admission`); a fault of the mapper's is
+    not caught here, for nothing that comes after it could be trusted.
+    """
+
+    def __init__(
+        self,
+        mapper: Mapper,
+        admission: Admission,
+        account: Account,
+        sinks: Sequence[Sink],
+        outgoing: Outgoing,
+        points_every_ns: int = 0,
+    ) -> None:
+        self._mapper, self._admission, self._account = mapper, admission, account
+        self._sinks, self._outgoing = tuple(sinks), outgoing
+        self._points_every_ns = points_every_ns  # 0: points are not sent
+        self._applied: dict[str, Applied] = {}
+        self._changed_tiles: set[Tile] = set()
+        self._points_sent_ns = 0
+        self.revision = 0
+        self.log_time_ns = 0  # of the newest message applied
+        self.is_stale = False  # something was inserted since the last update
+
+    def insert(self, envelope: Envelope) -> bool:
+        """Put one scan into the map, without deriving anything; False when it is left out."""
+        self.log_time_ns = max(self.log_time_ns, envelope.received_ns)
+        scan = self._admission.admit(envelope)
+        if scan is None:
+            return False
+        inserted = self._mapper.insert(scan)
+        self._count(scan, inserted.points_stored, inserted.rejected)
+        previous = self._applied.get(scan.source)
+        num_scans = (previous.num_scans if previous else 0) + 1
+        self._applied[scan.source] = Applied(envelope, scan, num_scans)
+        self.is_stale = True
+        self._emit(((envelope, scan),))
+        return True
+
+    def update(self) -> MapUpdate:
+        """Derive everything that is stale, and send what changed."""
+        stopwatch = Stopwatch()
+        update = self._mapper.update(stopwatch)
+        self.is_stale = False
+        self.revision = update.revision
+        self._account.stages(stopwatch.stage_ms)
+        self._account.count("updates")
+        self._emit(self._outgoing.update(update, self._cuts(update), self.log_time_ns))
+        self._emit(self._outgoing.poses([a.scan for a in self._applied.values()], self.log_time_ns))
+        self._changed_tiles.update(self._mapper.changed_tiles)
+        self._send_points(update)
+        return update
+
+    def finish(self) -> None:
+        """Send what was held back: the last points, the last scene."""
+        self._points_every_ns = min(self._points_every_ns, 1)
+        self._emit(self._outgoing.finish(self.log_time_ns))
+        self._send_points(None)
+
+    def _cuts(self, update: MapUpdate) -> list[Cut]:
+        """Where this update ends, by source, in the order of their names."""
+        cuts = []
+        for source in sorted(self._applied):
+            applied = self._applied[source]
+            envelope = applied.envelope
+            cuts.append(
+                Cut(
+                    revision=update.revision,
+                    robot=applied.scan.robot,
+                    sensor=applied.scan.sensor,
+                    epoch=envelope.epoch,
+                    sequence=envelope.sequence,
+                    stamp_ns=envelope.stamp_ns,
+                    num_scans=applied.num_scans,
+                )
+            )
+            applied.num_scans = 0
+        return cuts
+
+    def _send_points(self, update: MapUpdate | None) -> None:
+        due = self.log_time_ns - self._points_sent_ns >= self._points_every_ns
+        if not self._points_every_ns or not self._changed_tiles or (update and not due):
+            return
+        self._points_sent_ns = self.log_time_ns
+        tiles, self._changed_tiles = sorted(self._changed_tiles), set()
+        self._emit(self._outgoing.points(self._mapper.points(tiles), self.log_time_ns))
+
+    def _emit(self, messages: Iterable[tuple[Envelope, Message | None]]) -> None:
+        for envelope, message in messages:
+            for sink in self._sinks:
+                sink.write(envelope, message)
+
+    def _count(self, scan: Scan, points_stored: int, rejected: dict[str, int]) -> None:
+        count = self._account.count
+        count("applied", scan.source)
+        count("points_in", scan.source, len(scan.points))
+        count("points_stored", scan.source, points_stored)
+        for reason, num in rejected.items():
+            count(f"points_rejected.{reason}", "", num)
+
+
+class Stopwatch:
+    """Called as each stage ends; keeps the milliseconds of each."""
+
+    def __init__(self, clock: Callable[[], float] = time.perf_counter) -> None:
+        self.stage_ms: dict[str, float] = {}
+        self._clock, self._last = clock, clock()
+
+    def __call__(self, stage: str) -> None:
+        now = self._clock()
+        self.stage_ms[stage] = (now - self._last) * 1e3
+        self._last = now

@@ -1,0 +1,115 @@
+"""What clients may ask over Zenoh: snapshot, points, schema, commands. A thread of its own, since a
+reply travels with the asker's quality of service and may have to wait for the asker."""
+
+from __future__ import annotations
+
+import json
+import logging
+import queue
+import threading
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import zenoh
+
+from facet.sinks.publisher import encoding_of
+from facet.sinks.snapshots import Snapshots
+from facet_protocol import topics
+from facet_protocol.codec import encode, facet_descriptors
+
+logger = logging.getLogger(__name__)
+
+Command = Callable[[Mapping[str, str]], Mapping[str, Any]]
+MAX_QUESTIONS = 64
+
+
+class CommandError(Exception):
+    """A command that cannot be done now; the text is the answer."""
+
+
+class Answers:
+    """Queryables of one map. Every question gets an answer or an error that names the cause."""
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        map_id: str,
+        snapshots: Snapshots,
+        commands: Mapping[str, Command],
+    ) -> None:
+        self._map_id, self._snapshots = map_id, snapshots
+        self._questions: queue.Queue[tuple[Callable[[Any], None], Any] | None]
+        self._questions = queue.Queue(MAX_QUESTIONS)
+        self._queryables = [
+            self._declare(session, topics.snapshot_key(map_id), self._snapshot),
+            self._declare(session, topics.points_key(map_id), self._points),
+            self._declare(session, topics.schema_key(map_id), self._schema),
+        ]
+        for name, command in commands.items():
+            key = topics.cmd_key(map_id, name)
+            self._queryables.append(self._declare(session, key, self._obey(key, command)))
+        self._thread = threading.Thread(target=self._run, name="answers", daemon=True)
+        self._thread.start()
+
+    def close(self) -> None:
+        """Take no more questions."""
+        for queryable in self._queryables:
+            queryable.undeclare()
+        try:
+            self._questions.put(None, timeout=0.5)
+        except queue.Full:
+            logger.warning("a client does not take its answer")
+        self._thread.join(timeout=1.0)
+
+    def _declare(
+        self, session: zenoh.Session, key: str, answer: Callable[[Any], None]
+    ) -> zenoh.Queryable[Any]:
+        def ask(query: Any) -> None:  # on Zenoh's threads: only enqueue
+            try:
+                self._questions.put_nowait((answer, query))
+            except queue.Full:
+                _refuse(query, "busy: too many questions at once")
+
+        return session.declare_queryable(key, zenoh.handlers.Callback(ask, indirect=False))
+
+    def _run(self) -> None:
+        while (question := self._questions.get()) is not None:
+            answer, query = question
+            try:
+                with query:
+                    answer(query)
+            except Exception:  # a client that went away must not end the service of the others
+                logger.exception("a question could not be answered")
+
+    def _snapshot(self, query: Any) -> None:
+        since = query.parameters.get("since", "0")
+        if not since.isdecimal():
+            _refuse(query, f"since={since!r} is not a revision")
+            return
+        schema, payload = encode(self._snapshots.since(int(since)))
+        query.reply(topics.snapshot_key(self._map_id), payload, encoding=encoding_of(schema))
+
+    def _points(self, query: Any) -> None:
+        for tile in self._snapshots.tiles():
+            schema, payload = encode(tile)
+            query.reply(topics.points_key(self._map_id), payload, encoding=encoding_of(schema))
+
+    def _schema(self, query: Any) -> None:
+        encoding = encoding_of("google.protobuf.FileDescriptorSet")
+        query.reply(topics.schema_key(self._map_id), facet_descriptors(), encoding=encoding)
+
+    def _obey(self, key: str, command: Command) -> Callable[[Any], None]:
+        def answer(query: Any) -> None:
+            try:
+                result = command(dict(query.parameters))
+            except CommandError as error:
+                _refuse(query, str(error))
+                return
+            query.reply(key, json.dumps(result), encoding=zenoh.Encoding.APPLICATION_JSON)
+
+        return answer
+
+
+def _refuse(query: Any, text: str) -> None:
+    with query:
+        query.reply_err(text, encoding=zenoh.Encoding.TEXT_PLAIN)
