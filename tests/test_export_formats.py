@@ -4,12 +4,12 @@ from collections import Counter
 from dataclasses import replace
 
 import numpy as np
-import office
 import pytest
 import trimesh
 from PIL import Image
 from plyfile import PlyData
 
+import office
 from facet.export.colours import plane_colour, point_colours
 from facet.export.formats import FORMATS
 from facet.export.model import build_model

@@ -4,9 +4,9 @@ import json
 from dataclasses import fields, replace
 
 import numpy as np
-import office
 import pytest
 
+import office
 from facet.export.model import build_model, planes_of, read_model, write_model
 from facet_protocol.messages import Plane, ProtocolError
 

@@ -1,9 +1,9 @@
 """The plan reads walls, doors and windows as they stand; the cutaway hides what is behind."""
 
 import numpy as np
-import office
 import pytest
 
+import office
 from facet.export import cutaway
 from facet.export.floorplan import Piece, floor_level, wall_segments
 

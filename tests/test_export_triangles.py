@@ -1,9 +1,9 @@
 """Triangles cover exactly what the rings enclose, and face the side that was seen."""
 
 import numpy as np
-import office
 import pytest
 
+import office
 from facet.export.triangles import inward_normal, polygon, surface_triangles, triangulate
 
 

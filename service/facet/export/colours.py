@@ -31,7 +31,7 @@ def plane_colour(plane_id: int) -> Rgb:
     if plane_id <= 0:
         return UNASSIGNED
     hue = (plane_id * _GOLDEN) % 1.0
-    saturation, value = ((0.55, 0.95), (0.75, 0.80), (0.40, 0.90))[plane_id % 3]
+    saturation, value = ((0.45, 0.88), (0.58, 0.76), (0.32, 0.94))[plane_id % 3]
     r, g, b = colorsys.hsv_to_rgb(hue, saturation, value)
     return round(r * 255), round(g * 255), round(b * 255)
 

@@ -1,0 +1,238 @@
+"""Draws the map into one Rerun stream: into a file while replaying, or into a live viewer.
+
+`rr.log` can block for good (a viewer that stalls), so a live dashboard has its own process.
+What changes often waits here, the latest of each kind only, and is drawn a few times a second.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from pathlib import Path
+
+import numpy as np
+import rerun as rr
+from numpy.typing import NDArray
+
+from facet.sinks import drawing
+from facet_protocol.codec import Message
+from facet_protocol.messages import (
+    Envelope,
+    EventKind,
+    MapUpdate,
+    Plane,
+    PlaneClass,
+    Pose,
+    Scan,
+    Status,
+    TilePoints,
+)
+
+PLANES_EVERY_NS = 250_000_000  # of stamps
+POINTS_EVERY_NS = 1_000_000_000
+PATH_STEP_M = 0.05  # a robot that stands still grows no path
+PATH_PIECE = 64  # positions an entity: the piece under way is drawn again, the others are done
+
+
+class RobotPath:
+    """The last piece of where one robot went."""
+
+    def __init__(self) -> None:
+        self.piece = 0
+        self.positions: deque[NDArray[np.float64]] = deque(maxlen=PATH_PIECE)
+
+    def add(self, position: NDArray[np.float64]) -> bool:
+        """Whether there is something new to draw."""
+        if self.positions and np.linalg.norm(position - self.positions[-1]) < PATH_STEP_M:
+            return False
+        if len(self.positions) == PATH_PIECE:
+            self.positions = deque([self.positions[-1]], maxlen=PATH_PIECE)
+            self.piece += 1
+        self.positions.append(position.copy())
+        return len(self.positions) > 1
+
+
+class Dashboard:
+    """Everything that is drawn of one map. One thread; memory follows the map, not the time."""
+
+    def __init__(self, stream: rr.RecordingStream) -> None:
+        self._stream = stream
+        self._stamp_ns = 0
+        self._planes: dict[int, Plane] = {}
+        self._drawn: dict[int, str] = {}  # plane id: its entity
+        self._waiting_planes: set[int] = set()
+        self._waiting_tiles: dict[tuple[int, int, int], TilePoints] = {}
+        self._planes_due_ns = self._points_due_ns = 0
+        self._robots: dict[str, RobotPath] = {}
+        self._series: set[str] = set()
+        self._health = "OK"
+        self._extent = 0.0
+        stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        stream.send_blueprint(drawing.blueprint(None))
+
+    def draw(self, message: Message | None) -> None:
+        """One message of the pipeline, whatever it is; what cannot be drawn is passed over."""
+        match message:
+            case Scan():
+                self.write_scan_pose(message.robot, message.pose, message.stamp_ns)
+            case MapUpdate():
+                self.write_update(message)
+            case TilePoints():
+                self.write_points([message])
+            case Status():
+                self.write_status(message)
+            case _:
+                pass
+
+    def write_update(self, update: MapUpdate) -> None:
+        """A delta, or a snapshot (base 0), which replaces everything."""
+        retired = {t.plane_id for t in update.retired}
+        if update.base_revision == 0:
+            retired = self._planes.keys() - {plane.id for plane in update.changed}
+        gone = {number: self._planes.pop(number, None) for number in retired}
+        self._planes.update((plane.id, plane) for plane in update.changed)
+        self._waiting_planes |= retired | {plane.id for plane in update.changed}
+        self._advance(update.stamp_ns)
+        self._log_events(update, gone)
+
+    def write_points(self, tiles: list[TilePoints]) -> None:
+        self._waiting_tiles.update((tile.tile, tile) for tile in tiles)
+        self._advance(self._stamp_ns)
+
+    def write_scan_pose(self, robot: str, pose: Pose, stamp_ns: int) -> None:
+        """Where a robot's sensor was when it scanned."""
+        if not (np.isfinite(pose.position).all() and np.isfinite(pose.orientation_xyzw).all()):
+            return
+        self._advance(stamp_ns)
+        entity = f"robots/{robot}"
+        if robot not in self._robots:
+            self._robots[robot] = RobotPath()
+            self._stream.log(f"{entity}/marker/dot", drawing.robot_dot(robot), static=True)
+            self._stream.log(f"{entity}/marker/arrow", drawing.robot_arrow(), static=True)
+        self._stream.log(f"{entity}/marker", drawing.robot_transform(pose))
+        path = self._robots[robot]
+        if path.add(pose.position):
+            self._stream.log(f"{entity}/path/{path.piece}", drawing.path(path.positions))
+
+    def write_status(self, status: Status) -> None:
+        self._advance(status.stamp_ns)
+        for name, value in status.stage_ms.items():
+            self._log_number(f"stages/{name}", value)
+        for name, value in status.gauges.items():
+            self._log_number(f"gauges/{name}", value)
+        if status.health != self._health:
+            level = rr.TextLogLevel.INFO if status.health == "OK" else rr.TextLogLevel.WARN
+            self._stream.log("events/health", rr.TextLog(f"health {status.health}", level=level))
+            self._health = status.health
+
+    def flush(self) -> None:
+        """Draw what waits, whatever the time."""
+        self._draw_planes()
+        self._draw_tiles()
+
+    def _advance(self, stamp_ns: int) -> None:
+        """Time only goes on: robots and updates arrive out of step."""
+        self._stamp_ns = max(self._stamp_ns, stamp_ns)
+        self._stream.set_time(drawing.TIMELINE, timestamp=np.datetime64(self._stamp_ns, "ns"))
+        if self._stamp_ns >= self._planes_due_ns and self._waiting_planes:
+            self._planes_due_ns = self._stamp_ns + PLANES_EVERY_NS
+            self._draw_planes()
+        if self._stamp_ns >= self._points_due_ns and self._waiting_tiles:
+            self._points_due_ns = self._stamp_ns + POINTS_EVERY_NS
+            self._draw_tiles()
+
+    def _draw_planes(self) -> None:
+        if not self._waiting_planes:
+            return
+        for number in sorted(self._waiting_planes):
+            self._draw_plane(number, self._planes.get(number))
+        self._waiting_planes.clear()
+        for kind in PlaneClass:
+            planes = [p for p in self._planes.values() if p.plane_class is kind]
+            area = sum(s.area_m2 for plane in planes for s in plane.surfaces)
+            self._log_number(f"area/{kind.value}", area)
+        self._fit_view()
+
+    def _draw_plane(self, number: int, plane: Plane | None) -> None:
+        entity = f"map/planes/{plane.plane_class.value}/{number}" if plane else ""
+        before = self._drawn.pop(number, entity)
+        if before != entity:  # retired, or of another class now
+            self._stream.log(before, rr.Clear(recursive=True))
+        if plane is None:
+            return
+        self._drawn[number] = entity
+        mesh = drawing.mesh(plane)
+        self._stream.log(f"{entity}/surface", mesh or rr.Clear(recursive=False))
+        self._stream.log(f"{entity}/outline", drawing.outline(plane))
+
+    def _draw_tiles(self) -> None:
+        kinds = self._planes.items()
+        ceilings = [i for i, plane in kinds if plane.plane_class is PlaneClass.CEILING]
+        for key, tile in sorted(self._waiting_tiles.items()):
+            name = "_".join(str(k) for k in key)
+            below, above = drawing.split_tile(tile, ceilings)
+            self._stream.log(f"map/points/{name}", drawing.points(*below))
+            self._stream.log(f"map/ceiling/{name}", drawing.points(*above))
+        self._waiting_tiles.clear()
+
+    def _fit_view(self) -> None:
+        """Step back when the map has outgrown the view; otherwise leave the eye to the user."""
+        bounds = drawing.bounds_of(self._planes.values())
+        extent = 0.0 if bounds is None else float(np.linalg.norm(bounds[1] - bounds[0]))
+        if extent > 1.5 * self._extent:
+            self._extent = extent
+            self._stream.send_blueprint(drawing.blueprint(bounds))
+
+    def fit_view_finally(self) -> None:
+        """The view for someone who opens the finished file."""
+        self._stream.send_blueprint(drawing.blueprint(drawing.bounds_of(self._planes.values())))
+
+    def _log_number(self, entity: str, value: float) -> None:
+        if not np.isfinite(value):
+            return
+        if entity not in self._series:
+            self._series.add(entity)
+            curve = drawing.curve(entity.partition("/")[2])
+            self._stream.log(entity, curve, static=True)
+        self._stream.log(entity, rr.Scalars(float(value)))
+
+    def _log_events(self, update: MapUpdate, gone: dict[int, Plane | None]) -> None:
+        """A line each, but one for all that were only updated: that is most of them."""
+        num_updated = 0
+        for event in update.events:
+            if event.kind is EventKind.UPDATED:
+                num_updated += 1
+                continue
+            plane = self._planes.get(event.plane_id) or gone.get(event.plane_id)
+            text = drawing.event_text(event, plane)
+            self._stream.log("events", rr.TextLog(text, level=rr.TextLogLevel.INFO))
+        if num_updated:
+            text = f"{num_updated} planes updated, revision {update.revision}"
+            self._stream.log("events", rr.TextLog(text, level=rr.TextLogLevel.DEBUG))
+
+
+class RrdViewer:
+    """A sink that draws into an .rrd file; never blocks."""
+
+    def __init__(self, path: Path, name: str = "facet") -> None:
+        self._stream = rr.RecordingStream("facet", recording_id=name)
+        self._stream.set_log_time_enabled(False)
+        self._stream.set_log_tick_enabled(False)
+        self._stream.save(path)
+        self._dashboard = Dashboard(self._stream)
+        self._is_open = True
+        self.write_update = self._dashboard.write_update
+        self.write_points = self._dashboard.write_points
+        self.write_scan_pose = self._dashboard.write_scan_pose
+        self.write_status = self._dashboard.write_status
+
+    def write(self, envelope: Envelope, message: Message | None) -> None:
+        self._dashboard.draw(message)
+
+    def close(self) -> None:
+        """Draw what waits and finish the file; a second call does nothing."""
+        if self._is_open:
+            self._is_open = False
+            self._dashboard.flush()
+            self._dashboard.fit_view_finally()
+            self._stream.flush()
+            self._stream.disconnect()
