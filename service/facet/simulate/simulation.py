@@ -96,7 +96,7 @@ class Simulation:
             beams = beams @ rotation(about_z(phase)).T
         directions = beams @ rotation(orientation).T
         ranges, faces = self.faces.cast(position, directions)
-        far = ranges > sensor.max_range_m
+        far = np.isfinite(ranges) & (ranges > sensor.max_range_m)
         ranges[far], faces[far] = np.inf, -1
         stamp_ns = START_NS + index * self.period_ns
         return Look(index, stamp_ns, position, orientation, beams, directions, ranges, faces)
