@@ -8,56 +8,13 @@ import itertools
 import os
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
 
-from mcap.writer import CompressionType, Writer
-
 from facet.sinks.durable_file import DurableFile
-from facet_protocol.codec import Message, descriptor_set
-from facet_protocol.messages import Envelope, ProtocolError
-
-COMPRESSIONS = {
-    "lz4": CompressionType.LZ4,
-    "zstd": CompressionType.ZSTD,
-    "none": CompressionType.NONE,
-}
-CHUNK_BYTES = 1 << 20
-ChannelName = tuple[str, str, str, int, int]  # topic, schema, encoding, epoch, sequence >> 32
-
-
-@dataclass(slots=True)
-class OpenLog:
-    """One file being written, and what it has declared so far."""
-
-    file: DurableFile
-    writer: Writer
-    born_ns: int
-    schemas: dict[str, int] = field(default_factory=dict)
-    channels: dict[ChannelName, int] = field(default_factory=dict)
-
-    def channel(self, envelope: Envelope) -> int:
-        """The channel of a message; a new epoch opens a new one."""
-        high = envelope.sequence >> 32  # MCAP counts in 32 bits
-        name = (envelope.key, envelope.schema, envelope.encoding, envelope.epoch, high)
-        if name not in self.channels:
-            metadata = {"epoch": str(envelope.epoch)} if envelope.epoch else {}
-            if high:
-                metadata["sequence_high"] = str(high)
-            self.channels[name] = self.writer.register_channel(
-                envelope.key, envelope.encoding, self._schema(envelope.schema), metadata
-            )
-        return self.channels[name]
-
-    def _schema(self, name: str) -> int:
-        if name not in self.schemas:
-            try:
-                encoding, data = "protobuf", descriptor_set(name)
-            except ProtocolError:  # recorded all the same, by name
-                encoding, data = "", b""
-            self.schemas[name] = self.writer.register_schema(name, encoding, data)
-        return self.schemas[name]
+from facet.sinks.log_file import LogFile
+from facet_protocol.codec import Message
+from facet_protocol.messages import Envelope
 
 
 class Recorder:
@@ -84,11 +41,12 @@ class Recorder:
         self.paths: list[Path] = []
         self.committed_bytes = 0
         self._directory, self._name, self._metadata = directory, name, dict(metadata)
-        self._compression = COMPRESSIONS[compression]
+        self._compression = compression
         self._max_file_bytes, self._max_file_ns = max_file_bytes, max_file_ns
         self._min_free_bytes = min_free_bytes
         self._clock, self._open_file = clock, open_file
-        self._log: OpenLog | None = None
+        self._log: LogFile | None = None
+        self._born_ns = 0
         self._uncommitted: list[Envelope] = []
         self._log_time_ns = 0
         self._numbers = itertools.count(1)
@@ -109,8 +67,7 @@ class Recorder:
             log = self._log
             for envelope in self._uncommitted:
                 self._add(log, envelope)
-            log.writer.flush()
-            log.file.sync()
+            log.sync()
         except OSError:
             self._abandon()
             raise
@@ -130,52 +87,41 @@ class Recorder:
         if log is None:
             return
         try:
-            log.writer.finish()
-            log.file.sync()
+            log.finish()
         except OSError:
-            log.file.abandon()
+            log.abandon()
             raise
-        log.file.close()
 
     def close(self) -> None:
         """Commit what is left and finish the file. Raises OSError. A second call does nothing."""
         self.commit()
         self.roll()
 
-    def _open(self) -> OpenLog:
-        born_ns = self._clock()
-        stamp = datetime.fromtimestamp(born_ns // 10**9, tz=UTC).strftime("%Y%m%dT%H%M%SZ")
+    def _open(self) -> LogFile:
+        self._born_ns = self._clock()
+        stamp = datetime.fromtimestamp(self._born_ns // 10**9, tz=UTC).strftime("%Y%m%dT%H%M%SZ")
         path = self._directory / f"{self._name}-{stamp}-{next(self._numbers):03d}.mcap"
         while path.exists():
             path = self._directory / f"{self._name}-{stamp}-{next(self._numbers):03d}.mcap"
-        file = self._open_file(path)
+        log = LogFile(self._open_file(path), self._metadata, self._compression)
         self.paths.append(path)
-        writer = Writer(file, chunk_size=CHUNK_BYTES, compression=self._compression)  # type: ignore[arg-type]
-        writer.start(profile="", library="facet")
-        writer.add_metadata("facet", self._metadata)
-        return OpenLog(file, writer, born_ns)
+        return log
 
-    def _add(self, log: OpenLog, envelope: Envelope) -> None:
+    def _add(self, log: LogFile, envelope: Envelope) -> None:
         self._log_time_ns = max(self._log_time_ns, envelope.received_ns)  # never goes back
-        log.writer.add_message(
-            log.channel(envelope),
-            log_time=self._log_time_ns,
-            data=bytes(envelope.payload),
-            publish_time=envelope.stamp_ns,
-            sequence=envelope.sequence & 0xFFFFFFFF,
-        )
+        log.add(envelope, self._log_time_ns)
 
     def _abandon(self) -> None:
         log, self._log = self._log, None
         if log is not None:
-            log.file.abandon()
+            log.abandon()
 
     def _roll_if_due(self) -> None:
         log = self._log
         if log is None:
             return
-        age_ns = self._clock() - log.born_ns
-        if log.file.tell() >= self._max_file_bytes or age_ns >= self._max_file_ns:
+        age_ns = self._clock() - self._born_ns
+        if log.num_bytes >= self._max_file_bytes or age_ns >= self._max_file_ns:
             self.roll()
 
     def _check_free(self) -> None:

@@ -85,6 +85,8 @@ class McapStream:
                 if record is None:
                     break
                 yield from self._read(*record)
+            if self.is_finished and file.read(len(MAGIC)) != MAGIC:
+                self.damage.add(file.tell(), 0, "the last magic is missing")
         self._check_counts()
 
     def _next_record(self, file: BinaryIO) -> tuple[int, int, bytes] | None:

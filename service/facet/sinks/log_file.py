@@ -1,0 +1,120 @@
+"""One MCAP file being written: channels and schemas are declared as messages need them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+
+from mcap.writer import CompressionType, Writer
+
+from facet.sinks.durable_file import DurableFile
+from facet_protocol.codec import descriptor_set
+from facet_protocol.messages import Envelope, ProtocolError
+
+COMPRESSIONS = {
+    "lz4": CompressionType.LZ4,
+    "zstd": CompressionType.ZSTD,
+    "none": CompressionType.NONE,
+}
+CHUNK_BYTES = 1 << 20
+SYNC_BYTES = 8 << 20
+ChannelName = tuple[str, str, str, int, int]  # topic, schema, encoding, epoch, sequence >> 32
+
+
+class LogFile:
+    """Chunks with CRCs, a summary at the end; what was added is durable after `sync`."""
+
+    def __init__(
+        self, file: DurableFile, metadata: Mapping[str, str], compression: str = "lz4"
+    ) -> None:
+        self._file = file
+        self._schemas: dict[str, int] = {}
+        self._channels: dict[ChannelName, int] = {}
+        self._writer = Writer(
+            file,  # type: ignore[arg-type]  # it needs write, tell and flush alone
+            chunk_size=CHUNK_BYTES,
+            compression=COMPRESSIONS[compression],
+        )
+        self._writer.start(profile="", library="facet")
+        self._writer.add_metadata("facet", dict(metadata))
+
+    @property
+    def num_bytes(self) -> int:
+        return self._file.tell()
+
+    def add(self, envelope: Envelope, log_time_ns: int) -> None:
+        """Take one message; its bytes are not looked into."""
+        self._writer.add_message(
+            self._channel(envelope),
+            log_time=log_time_ns,
+            data=bytes(envelope.payload),
+            publish_time=envelope.stamp_ns,
+            sequence=envelope.sequence & 0xFFFFFFFF,
+        )
+
+    def sync(self) -> None:
+        """Close the chunk in progress and wait for the disk. Raises OSError."""
+        self._writer.flush()
+        self._file.sync()
+
+    def finish(self) -> None:
+        """Write the summary and close the file. Raises OSError."""
+        self._writer.finish()
+        self._file.sync()
+        self._file.close()
+
+    def abandon(self) -> None:
+        """Cut back to the last good chunk and close; never raises."""
+        self._file.abandon()
+
+    def _channel(self, envelope: Envelope) -> int:
+        """The channel of a message; a new epoch opens a new one."""
+        high = envelope.sequence >> 32  # MCAP counts in 32 bits
+        name = (envelope.key, envelope.schema, envelope.encoding, envelope.epoch, high)
+        if name not in self._channels:
+            metadata = {"epoch": str(envelope.epoch)} if envelope.epoch else {}
+            if high:
+                metadata["sequence_high"] = str(high)
+            schema = self._schema(envelope.schema) if envelope.schema else 0
+            self._channels[name] = self._writer.register_channel(
+                envelope.key, envelope.encoding, schema, metadata
+            )
+        return self._channels[name]
+
+    def _schema(self, name: str) -> int:
+        if name not in self._schemas:
+            try:
+                encoding, data = "protobuf", descriptor_set(name)
+            except ProtocolError:  # recorded all the same, by name
+                encoding, data = "", b""
+            self._schemas[name] = self._writer.register_schema(name, encoding, data)
+        return self._schemas[name]
+
+
+def write_recording(
+    path: Path, envelopes: Iterable[Envelope], metadata: Mapping[str, str], compression: str = "lz4"
+) -> int:
+    """Write a whole recording in one go, over one that is there; how many messages it holds.
+
+    Stopped half way it leaves nothing behind: the file gets its name when it is finished.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(path.name + ".part")
+    partial.unlink(missing_ok=True)
+    log = LogFile(DurableFile(partial), metadata, compression)
+    num = log_time_ns = synced = 0
+    try:
+        for envelope in envelopes:
+            log_time_ns = max(log_time_ns, envelope.received_ns)
+            log.add(envelope, log_time_ns)
+            num += 1
+            if log.num_bytes - synced > SYNC_BYTES:
+                log.sync()
+                synced = log.num_bytes
+        log.finish()
+    except BaseException:
+        log.abandon()
+        partial.unlink(missing_ok=True)
+        raise
+    partial.replace(path)
+    return num
