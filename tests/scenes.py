@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from facet.simulate import SCENES, SENSORS, Noise, Observer, Scene, Sensor, Simulation, Truth
 from facet.simulate.drive import Drive
-from facet.simulate.simulation import project
 from facet.simulate.surfaces import Opening, box, level_rectangle, room_walls
 from facet_protocol.messages import LineFan, Pose, Scan, ScanKind
+from facet_protocol.scans import project
 
 SHARED_DATA = Path(__file__).parents[2] / "shared" / "data"
 

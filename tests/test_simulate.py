@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +14,12 @@ from facet.simulate.raycast import GLASS, NOTHING, Faces
 from facet.simulate.sensors import about_z, multiply, rotation
 from facet.simulate.surfaces import TruthSurface, level_rectangle
 from facet.simulate.truth import CELL_M, cells_in_ring, closed, grown
-from facet_protocol.messages import HoleKind, LineFan, Scan, ScanKind
+from facet_protocol.codec import encode
+from facet_protocol.messages import Envelope, HoleKind, LineFan, Scan, ScanKind
+from facet_protocol.scans import decode_scan
 from scenes import Driven, drive, driven, quaternion_xyzw, recorded, room, small
 
+KEY = "facet/v1/map/robot/sim/scan/sensor"
 SILENT = Noise(0.0, 0.0, 0.0)
 
 
@@ -114,6 +118,15 @@ def test_pose_noise_is_in_the_message_only() -> None:
         )
     assert np.std(shifts) == pytest.approx(0.01, rel=0.1)
     assert np.sqrt(np.mean(np.square(turns))) == pytest.approx(0.5, rel=0.15)
+
+
+def test_what_is_simulated_is_what_its_reader_gets(sensor: Sensor) -> None:
+    simulation = Simulation(room(), sensor, num_scans=4)
+    for message, scan in zip(simulation.messages(), simulation.scans(), strict=True):
+        schema, payload = encode(message)
+        envelope = Envelope(KEY, schema, "protobuf", payload)
+        head = {"robot": "sim", "sensor": sensor.name, "epoch": 1, "sequence": scan.sequence}
+        assert same(replace(decode_scan(envelope, "sim", sensor.name), **head), scan)
 
 
 def test_glass_and_open_doors_come_back_empty() -> None:

@@ -12,7 +12,7 @@ from facet.simulate.raycast import Faces
 from facet.simulate.scenes import SCENES, Scene
 from facet.simulate.sensors import SENSORS, Sensor, about_z, multiply, rotation
 from facet_protocol.messages import LineFan, Pose, Scan, ScanKind
-from facet_protocol.projection import project_fan
+from facet_protocol.scans import REACH_M, project
 
 Float = NDArray[np.float64]
 START_NS = 1_700_000_000_000_000_000
@@ -57,7 +57,7 @@ class Simulation:
         duration_s: float | None = None,
         speed_mps: float | None = None,
         rate_hz: float | None = None,
-        reach_m: float = 8.0,
+        reach_m: float = REACH_M,
         robot: str = "sim",
     ) -> None:
         """`num_scans`, or what `max_points` allows, are spread over the whole drive.
@@ -141,15 +141,6 @@ class Simulation:
         return np.random.Generator(np.random.PCG64(sequence))
 
 
-def project(fan: LineFan, reach_m: float) -> Scan:
-    """The scan that a reader makes of a fan."""
-    points, no_return = project_fan(fan.start_angle, fan.end_angle, fan.ranges, reach_m)
-    return Scan(
-        fan.robot, fan.sensor, fan.epoch, fan.sequence, fan.stamp_ns, fan.frame_id, ScanKind.LINE,
-        fan.pose, points, no_return,
-    )  # fmt: skip
-
-
 def simulate(
     scene: str | Scene,
     sensor: str | Sensor,
@@ -163,7 +154,7 @@ def simulate(
     duration_s: float | None = None,
     speed_mps: float | None = None,
     rate_hz: float | None = None,
-    reach_m: float = 8.0,
+    reach_m: float = REACH_M,
 ) -> Iterator[Scan]:
     """Scans of a scene; see Simulation for what the options mean."""
     return Simulation(
