@@ -1,0 +1,110 @@
+"""Index arithmetic: voxel and block keys, and the open-addressing table from block key to block."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+Int64Array = NDArray[np.int64]
+
+OFFSET = 1 << 20  # voxel indices are in [-OFFSET, OFFSET)
+MASK = (1 << 21) - 1
+EMPTY = np.int64(-1)
+CENTRE = 13  # a block's own place among its 27 neighbours
+
+
+@njit(cache=True, nogil=True)
+def pack(i: int, j: int, k: int) -> int:
+    """One sortable int64 from three indices in [-2^20, 2^20)."""
+    return ((i + OFFSET) << 42) | ((j + OFFSET) << 21) | (k + OFFSET)
+
+
+@njit(cache=True, nogil=True)
+def unpack(key: int) -> tuple[int, int, int]:
+    """The inverse of `pack`."""
+    return (key >> 42) - OFFSET, ((key >> 21) & MASK) - OFFSET, (key & MASK) - OFFSET
+
+
+def unpack_all(keys: Int64Array) -> Int64Array:
+    """(N,) keys to (N, 3) indices."""
+    return np.stack(
+        [(keys >> 42) - OFFSET, ((keys >> 21) & MASK) - OFFSET, (keys & MASK) - OFFSET], axis=-1
+    )
+
+
+def pack_all(ijk: Int64Array) -> Int64Array:
+    """(N, 3) indices to (N,) keys."""
+    i, j, k = (ijk[..., axis].astype(np.int64) + OFFSET for axis in range(3))
+    return np.asarray((i << 42) | (j << 21) | k, dtype=np.int64)
+
+
+@njit(cache=True, nogil=True)
+def hash_key(key: int) -> int:
+    """A 63-bit mix (splitmix64's finaliser)."""
+    z = np.uint64(key)
+    z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    z = (z ^ (z >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return np.int64((z ^ (z >> np.uint64(31))) >> np.uint64(1))
+
+
+@njit(cache=True, nogil=True)
+def find(table_keys: Int64Array, table_values: NDArray[np.int32], key: int) -> int:
+    """The value stored under `key`, or -1. Table size is a power of two, never full."""
+    mask = table_keys.shape[0] - 1
+    slot = hash_key(key) & mask
+    while True:
+        if table_keys[slot] == key:
+            return table_values[slot]
+        if table_keys[slot] == EMPTY:
+            return -1
+        slot = (slot + 1) & mask
+
+
+@njit(cache=True, nogil=True)
+def put(table_keys: Int64Array, table_values: NDArray[np.int32], key: int, value: int) -> None:
+    """Store a key that is not in the table yet."""
+    mask = table_keys.shape[0] - 1
+    slot = hash_key(key) & mask
+    while table_keys[slot] != EMPTY:
+        slot = (slot + 1) & mask
+    table_keys[slot] = key
+    table_values[slot] = value
+
+
+@njit(cache=True, nogil=True)
+def rehash(keys: Int64Array, count: int, size: int) -> tuple[Int64Array, NDArray[np.int32]]:
+    """A table of `size` slots that maps keys[b] to b."""
+    table_keys = np.full(size, EMPTY, np.int64)
+    table_values = np.full(size, -1, np.int32)
+    for b in range(count):
+        put(table_keys, table_values, keys[b], b)
+    return table_keys, table_values
+
+
+class Blocks(NamedTuple):
+    """Blocks of 8^3 voxels as columns; what the kernels read. All (B, ...) with capacity B."""
+
+    table_keys: Int64Array  # (H,)
+    table_values: NDArray[np.int32]  # (H,)
+    keys: Int64Array  # (B,) packed block index
+    rows: NDArray[np.int32]  # (B, 512) voxel row at local index x + 8 y + 64 z, -1: none
+    occupied: NDArray[np.uint64]  # (B, 8) a bit x + 8 y for each z: observable says occupied
+    neighbours: NDArray[np.int32]  # (B, 27) at (dx+1) + 3 (dy+1) + 9 (dz+1), -1: none
+
+
+@njit(cache=True, nogil=True)
+def add_block(blocks: Blocks, count: int, key: int) -> int:
+    """Append the block `key` as number `count` and link it with its neighbours. Returns `count`."""
+    blocks.keys[count] = key
+    put(blocks.table_keys, blocks.table_values, key, count)
+    bi, bj, bk = unpack(key)
+    for n in range(27):
+        other_key = pack(bi + n % 3 - 1, bj + (n // 3) % 3 - 1, bk + n // 9 - 1)
+        other = find(blocks.table_keys, blocks.table_values, other_key)
+        blocks.neighbours[count, n] = other
+        if other >= 0:
+            blocks.neighbours[other, 26 - n] = count
+    return count

@@ -1,0 +1,118 @@
+"""Counting: scans and points at the door, voxels by their fate; and voxels for display."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from facet.mapping.bits import trailing_zeros
+from facet.mapping.blocks import CENTRE, unpack
+from facet.mapping.normals import ALIGNED, MIXED, SPARSE, THICK, VALID, Normals
+from facet.mapping.patches import Patches
+from facet.mapping.quantise import Ticks
+from facet.mapping.report import MapCounts
+from facet.mapping.store import VoxelStore
+from facet.mapping.tiles import TileField
+from facet_protocol.messages import Scan, TilePoints
+
+
+class Census:
+    """Counters of what was inserted and not retracted."""
+
+    def __init__(self) -> None:
+        self._scans = 0
+        self._points_in = 0
+        self._points_stored = 0
+        self._rejected: dict[str, int] = {}
+
+    def count(self, scan: Scan, ticks: Ticks, sign: int) -> None:
+        """Account for one scan inserted (1) or retracted (-1): every point stored or rejected."""
+        self._scans += sign
+        self._points_in += sign * len(scan.points)
+        self._points_stored += sign * len(ticks.points)
+        for reason, number in ticks.rejected.items():
+            self._rejected[reason] = self._rejected.get(reason, 0) + sign * number
+
+    def take(
+        self, store: VoxelStore, normals: Normals, tiles: TileField, sigma_m: float
+    ) -> MapCounts:
+        """All counts, as of the last update."""
+        rows = store.occupied_rows()
+        kinds = np.bincount(normals.kind[rows], minlength=6)
+        placed = np.zeros(max(store.num_rows, 1), np.bool_)
+        for tile in tiles.tiles.values():
+            on = (tile.ids[tile.owner] != 0) & ~tile.corner
+            placed[tile.rows[on]] = True
+        off = rows[~placed[rows]]
+        return MapCounts(
+            scans=self._scans,
+            points_in=self._points_in,
+            points_stored=self._points_stored,
+            points_rejected={k: n for k, n in sorted(self._rejected.items()) if n},
+            voxels=len(rows),
+            valid=int(kinds[VALID]),
+            aligned=int(kinds[ALIGNED]),
+            thick=int(kinds[THICK]),
+            sparse=int(kinds[SPARSE]),
+            mixed=int(kinds[MIXED]),
+            discarded=len(off),
+            discarded_points=int(store.columns.moments[off, 0].sum()),
+            sigma_n_m=sigma_m,
+        )
+
+
+@njit(cache=True, nogil=True)
+def _fill(blocks, observable, label, id_of_patch, which, tile, centroids, ids):  # type: ignore[no-untyped-def]
+    count = 0
+    for q in range(which.shape[0]):
+        block = which[q]
+        i, j, k = unpack(blocks.keys[block])
+        corner = (8 * (i - 8 * tile[0]), 8 * (j - 8 * tile[1]), 8 * (k - 8 * tile[2]))
+        for z in range(8):
+            word = blocks.occupied[block, z]
+            while word != np.uint64(0):
+                bit = np.int64(trailing_zeros(word))
+                word &= word - np.uint64(1)
+                row = blocks.rows[block, 64 * z + bit]
+                seen = observable[row]
+                centroids[count, 0] = 8 * (corner[0] + (bit & 7)) + (seen & 15)
+                centroids[count, 1] = 8 * (corner[1] + (bit >> 3)) + ((seen >> 4) & 15)
+                centroids[count, 2] = 8 * (corner[2] + z) + ((seen >> 8) & 15)
+                ids[count] = 0
+                own = label[row]
+                if own >= 0:
+                    n = own >> 4
+                    other = block if n == CENTRE else blocks.neighbours[block, n]
+                    ids[count] = id_of_patch[other, own & 15]
+                count += 1
+
+
+def _ids_of_patches(tiles: TileField) -> NDArray[np.int32]:
+    """(B, PER_BLOCK) plane id of each patch, 0: none."""
+    ids = np.zeros(tiles.plane_of_patch.shape, np.int32)
+    for tile in tiles.tiles.values():
+        if len(tile.ids):
+            own = np.minimum(tiles.plane_of_patch[tile.blocks], len(tile.ids) - 1)
+            ids[tile.blocks] = tile.ids[own]
+    return ids
+
+
+def tile_points(
+    store: VoxelStore, patches: Patches, tiles: TileField, keys: list[int], voxel_m: float
+) -> list[TilePoints]:
+    """The voxels of tiles with their plane ids."""
+    id_of_patch = _ids_of_patches(tiles)
+    out = []
+    for key in keys:
+        tile = tiles.tiles.get(key)
+        which = tile.blocks if tile is not None else np.zeros(0, np.int32)
+        count = int(np.bitwise_count(store.blocks.occupied[which]).sum())
+        centroids, ids = np.empty((count, 3), np.uint16), np.empty(count, np.int32)
+        index = unpack(key)
+        _fill(
+            store.blocks, store.columns.observable, patches.label, id_of_patch, which, index,
+            centroids, ids,
+        )  # fmt: skip
+        out.append(TilePoints(index, voxel_m, centroids, ids))
+    return out

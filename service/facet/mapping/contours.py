@@ -1,0 +1,242 @@
+"""Outlines of every plane, by tile of its (u, v) frame: only dirty tiles are rolled over again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from facet.mapping.blocks import unpack
+from facet.mapping.pivot import CELLS, HALO, boundary_edges
+from facet.mapping.rings import Outline, surfaces_of
+from facet.mapping.settings import STEPS, MapSettings
+from facet.mapping.store import VoxelStore
+from facet.mapping.tiles import Tile
+from facet_protocol.messages import PlaneFrame
+
+UnitNormal = tuple[int, int, int]
+FRAME_UNIT = 32  # a frame's normal is rounded to 1/32 a component: it moves rarely
+SIZE = CELLS * STEPS  # grid units of a (u, v) tile's edge
+Place = tuple[int, int]  # of a (u, v) tile
+
+
+def round_normal(normal: NDArray[np.float64]) -> UnitNormal:
+    """The integers that name a plane's frame."""
+    n = np.floor(normal * FRAME_UNIT + 0.5).astype(int)
+    return int(n[0]), int(n[1]), int(n[2])
+
+
+def make_frame(rounded: UnitNormal, voxel_m: float) -> PlaneFrame:
+    """Axes from a rounded normal: u level wherever the plane is not."""
+    n = np.array(rounded, np.float64)
+    n /= np.sqrt(n @ n)
+    up = np.array([0.0, 0.0, 1.0]) if abs(n[2]) < 0.9 else np.array([0.0, 1.0, 0.0])
+    u = np.cross(up, n)
+    u /= np.sqrt(u @ u)
+    return PlaneFrame(axis_u=u, axis_v=np.cross(n, u), axis_n=n, step_m=voxel_m / STEPS)
+
+
+@njit(cache=True, nogil=True)
+def _project(rows, owner, plane, blocks, block_of, local_of, observable, axis_u, axis_v, out):  # type: ignore[no-untyped-def]
+    """(u, v) in grid units of the voxels that `owner` gives to `plane`. Returns how many."""
+    count = 0
+    for m in range(rows.shape[0]):
+        if owner[m] != plane:
+            continue
+        row = rows[m]
+        i, j, k = unpack(blocks.keys[block_of[row]])
+        local = local_of[row]
+        seen = observable[row]
+        x = 64 * i + 8 * (local & 7) + (seen & 15)
+        y = 64 * j + 8 * ((local >> 3) & 7) + ((seen >> 4) & 15)
+        z = 64 * k + 8 * (local >> 6) + ((seen >> 8) & 15)
+        out[count, 0] = np.floor(x * axis_u[0] + y * axis_u[1] + z * axis_u[2] + 0.5)
+        out[count, 1] = np.floor(x * axis_v[0] + y * axis_v[1] + z * axis_v[2] + 0.5)
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _paint(points, tile_u, tile_v, cells):  # type: ignore[no-untyped-def]
+    """Set the bits of the points (N, 2) that lie in a (u, v) tile."""
+    for p in range(points.shape[0]):
+        u, v = points[p, 0] - SIZE * tile_u, points[p, 1] - SIZE * tile_v
+        if 0 <= u < SIZE and 0 <= v < SIZE:
+            bit = np.uint64(1) << np.uint64((u & 7) + 8 * (v & 7))
+            cells[v >> 3, u >> 3] |= bit
+
+
+@njit(cache=True, nogil=True)
+def _places(points):  # type: ignore[no-untyped-def]
+    """(u, v) tiles that points (N, 2) fall into, as tile_u * 2^32 + tile_v, each once."""
+    seen = np.empty(64, np.int64)
+    count = 0
+    last = np.int64(-(2**62))
+    for p in range(points.shape[0]):
+        key = (np.int64(points[p, 0]) // SIZE) * (1 << 32) + np.int64(points[p, 1]) // SIZE
+        if key == last:
+            continue
+        last = key
+        known = False
+        for s in range(count):
+            if seen[s] == key:
+                known = True
+                break
+        if not known and count < 64:
+            seen[count] = key
+            count += 1
+    return seen[:count]
+
+
+@dataclass(slots=True)
+class Share:
+    """What one tile-plane gives to its plane's outline."""
+
+    points: NDArray[np.int32]  # (N, 2) grid units
+    places: frozenset[Place]
+
+
+@dataclass(slots=True)
+class Contour:
+    """The outline of one plane, with what is needed to change a part of it."""
+
+    rounded: UnitNormal
+    frame: PlaneFrame
+    shares: dict[tuple[int, int], Share] = field(default_factory=dict)  # by (tile key, tile-plane)
+    cells: dict[Place, NDArray[np.uint64]] = field(default_factory=dict)
+    edges: dict[Place, NDArray[np.int32]] = field(default_factory=dict)
+    outlines: list[Outline] = field(default_factory=list)
+
+
+class ContourField:
+    """Contours by plane id. An id only names a cache entry: every outline is a pure function of
+    the plane's frame and voxels."""
+
+    def __init__(self, settings: MapSettings) -> None:
+        self._voxel_m = settings.voxel_m
+        self._least = settings.min_surface_m2 / (settings.voxel_m / STEPS) ** 2
+        self.contours: dict[int, Contour] = {}
+        self.rolled = 0  # (u, v) tiles rolled over in the last update
+
+    def update(
+        self,
+        store: VoxelStore,
+        tiles: dict[int, Tile],
+        changed: set[int],
+        planes: dict[int, tuple[NDArray[np.float64], list[tuple[int, int]]]],
+    ) -> set[int]:
+        """Bring the outlines up to date with `planes`: by id, the inside normal and the tile-planes
+        (tile key, number). `changed` are the tiles whose voxels changed.
+
+        Returns ids of the planes whose outlines changed."""
+        self.rolled = 0
+        for gone in self.contours.keys() - planes.keys():
+            del self.contours[gone]
+        different = set()
+        for plane_id in sorted(planes):
+            normal, members = planes[plane_id]
+            rounded = round_normal(normal)
+            contour = self.contours.get(plane_id)
+            if contour is None or contour.rounded != rounded:
+                contour = Contour(rounded, make_frame(rounded, self._voxel_m))
+                self.contours[plane_id] = contour
+                different.add(plane_id)
+            if self._refresh(contour, store, tiles, changed, members):
+                different.add(plane_id)
+        return different
+
+    def _refresh(
+        self,
+        contour: Contour,
+        store: VoxelStore,
+        tiles: dict[int, Tile],
+        changed: set[int],
+        members: list[tuple[int, int]],
+    ) -> bool:
+        stale: set[Place] = set()
+        wanted = set(members)
+        for member in sorted(contour.shares.keys() - wanted):
+            stale |= contour.shares.pop(member).places
+        for member in members:
+            old = contour.shares.get(member)
+            if old is not None and member[0] not in changed:
+                continue
+            share = self._share(contour.frame, store, tiles[member[0]], member[1])
+            if old is not None:
+                if np.array_equal(old.points, share.points):
+                    continue
+                stale |= old.places
+            stale |= share.places
+            contour.shares[member] = share
+        dirty = {place for place in sorted(stale) if self._repaint(contour, place)}
+        if not dirty:
+            return False
+        near = {(u + a, v + b) for u, v in dirty for a in (-1, 0, 1) for b in (-1, 0, 1)}
+        moved = False
+        for place in sorted(near & (contour.cells.keys() | contour.edges.keys())):
+            moved |= self._roll(contour, place)
+        if moved:
+            edges = [contour.edges[p] for p in sorted(contour.edges) if len(contour.edges[p])]
+            whole = np.concatenate(edges) if edges else np.zeros((0, 4), np.int32)
+            contour.outlines = surfaces_of(whole.astype(np.int64), self._least)
+        return moved
+
+    def _share(self, frame: PlaneFrame, store: VoxelStore, tile: Tile, plane: int) -> Share:
+        points = np.empty((len(tile.rows), 2), np.int32)
+        count = _project(
+            tile.rows, tile.owner, plane, store.blocks, store.columns.block, store.columns.local,
+            store.columns.observable, frame.axis_u, frame.axis_v, points,
+        )  # fmt: skip
+        points = points[:count].copy()
+        keys = _places(points)
+        places = frozenset(
+            (int((k + (1 << 31)) >> 32), int(((k + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)))
+            for k in keys.tolist()
+        )
+        return Share(points, places)
+
+    def _repaint(self, contour: Contour, place: Place) -> bool:
+        """Draw a (u, v) tile again from all shares. Whether it changed."""
+        cells = np.zeros((CELLS, CELLS), np.uint64)
+        drawn = False
+        for share in contour.shares.values():
+            if place in share.places:
+                _paint(share.points, place[0], place[1], cells)
+                drawn = True
+        old = contour.cells.get(place)
+        if drawn:
+            contour.cells[place] = cells
+        else:
+            contour.cells.pop(place, None)
+        return old is None or not drawn or not np.array_equal(old, cells)
+
+    def _roll(self, contour: Contour, place: Place) -> bool:
+        """Find a tile's boundary edges again. Whether they changed."""
+        self.rolled += 1
+        old = contour.edges.get(place)
+        if place not in contour.cells:
+            contour.edges.pop(place, None)
+            return old is not None and len(old) > 0
+        edges = boundary_edges(self._window(contour, place))
+        edges += np.tile(np.array(place, np.int32) * SIZE, 2)
+        contour.edges[place] = edges
+        return old is None or not np.array_equal(old, edges)
+
+    @staticmethod
+    def _window(contour: Contour, place: Place) -> NDArray[np.uint64]:
+        window = np.zeros((CELLS + 2 * HALO,) * 2, np.uint64)
+        for b, rows, own_rows in _PARTS:
+            for a, columns, own_columns in _PARTS:
+                cells = contour.cells.get((place[0] + a, place[1] + b))
+                if cells is not None:
+                    window[rows, columns] = cells[own_rows, own_columns]
+        return window
+
+
+_PARTS = (
+    (-1, slice(0, HALO), slice(CELLS - HALO, CELLS)),
+    (0, slice(HALO, HALO + CELLS), slice(0, CELLS)),
+    (1, slice(HALO + CELLS, 2 * HALO + CELLS), slice(0, HALO)),
+)

@@ -1,0 +1,169 @@
+"""Planes as users see them: figures, outlines, holes with their kind, lasting surface ids."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from facet.mapping.contours import Contour
+from facet.mapping.fitting import Fit
+from facet.mapping.freespace import FreeSpace
+from facet.mapping.openings import hole_kind, probes
+from facet.mapping.rings import Outline
+from facet.mapping.settings import MapSettings
+from facet.mapping.witness import Sighting
+from facet_protocol.messages import Hole, HoleKind, Plane, Surface
+
+SAME_SURFACE_M = 1.0  # centres of one surface in two updates are no farther apart
+
+
+class Figures(NamedTuple):
+    """What a plane's description is made of, besides its contour."""
+
+    fit: Fit
+    num_points: int
+    num_voxels: int
+    centroid: NDArray[np.float64]  # (3,) m
+    sighting: Sighting
+
+
+@dataclass(slots=True)
+class _Entry:
+    key: tuple[bytes, ...]
+    outlines: list[Outline]
+    probes: list[list[NDArray[np.int64]]]  # by outline and hole
+    kinds: list[list[HoleKind]]
+    plane: Plane
+
+
+class Describer:
+    """Keeps the description of every plane, and says which changed."""
+
+    def __init__(self, settings: MapSettings) -> None:
+        self._settings = settings
+        self._entries: dict[int, _Entry] = {}
+        self._next_surface = 1
+
+    @property
+    def planes(self) -> list[Plane]:
+        """All planes, by ascending id."""
+        return [self._entries[i].plane for i in sorted(self._entries)]
+
+    def __getitem__(self, plane_id: int) -> Plane:
+        return self._entries[plane_id].plane
+
+    def update(
+        self, figures: dict[int, Figures], contours: dict[int, Contour], free: FreeSpace
+    ) -> list[int]:
+        """Describe all planes again where anything changed. Returns the changed ids, ascending."""
+        for gone in self._entries.keys() - figures.keys():
+            del self._entries[gone]
+        changed = []
+        for plane_id in sorted(figures):
+            if self._refresh(plane_id, figures[plane_id], contours[plane_id], free):
+                changed.append(plane_id)
+        return changed
+
+    def _refresh(self, plane_id: int, own: Figures, contour: Contour, free: FreeSpace) -> bool:
+        key = _key(own, contour)
+        old = self._entries.get(plane_id)
+        same = old is not None and old.key == key and old.outlines is contour.outlines
+        found = old.probes if same and old is not None else self._probes(own.fit, contour)
+        kinds = [[hole_kind(p, free, self._settings) for p in holes] for holes in found]
+        if same and old is not None and old.kinds == kinds:
+            return False
+        revision = old.plane.revision + 1 if old is not None else 1
+        surfaces = self._surfaces(contour, kinds, old)
+        plane = _plane(plane_id, revision, own, contour, surfaces)
+        self._entries[plane_id] = _Entry(key, contour.outlines, found, kinds, plane)
+        return True
+
+    def _probes(self, fit: Fit, contour: Contour) -> list[list[NDArray[np.int64]]]:
+        return [
+            [probes(h, contour.frame, fit.inside, fit.offset_m, self._settings) for h in o.holes]
+            for o in contour.outlines
+        ]
+
+    def _surfaces(
+        self, contour: Contour, kinds: list[list[HoleKind]], old: _Entry | None
+    ) -> tuple[Surface, ...]:
+        step2 = contour.frame.step_m**2
+        ids = self._surface_ids(contour, old)
+        return tuple(
+            Surface(
+                id=surface_id,
+                area_m2=outline.area * step2,
+                outer=outline.outer,
+                holes=tuple(
+                    Hole(kind, ring) for kind, ring in zip(own, outline.holes, strict=True)
+                ),
+            )
+            for surface_id, outline, own in zip(ids, contour.outlines, kinds, strict=True)
+        )
+
+    def _surface_ids(self, contour: Contour, old: _Entry | None) -> list[int]:
+        """The nearest surface of the last description keeps its id, largest first."""
+        ids = [0] * len(contour.outlines)
+        if old is not None:
+            before = [(s.id, _centre(s.outer, old.plane.frame)) for s in old.plane.surfaces]
+            now = [_centre(o.outer, contour.frame) for o in contour.outlines]
+            order = sorted(
+                (float(np.linalg.norm(c - b)), surface_id, index)
+                for surface_id, b in before
+                for index, c in enumerate(now)
+            )
+            taken = set()
+            for distance, surface_id, index in order:
+                if distance <= SAME_SURFACE_M and not ids[index] and surface_id not in taken:
+                    ids[index] = surface_id
+                    taken.add(surface_id)
+        for index, known in enumerate(ids):
+            if not known:
+                ids[index] = self._next_surface
+                self._next_surface += 1
+        return ids
+
+
+def _centre(ring: NDArray[np.int32], frame: object) -> NDArray[np.float64]:
+    """Middle of a ring's box in the frame, lifted to no plane: good enough to compare."""
+    middle = (ring.min(axis=0) + ring.max(axis=0)) / 2.0 * frame.step_m  # type: ignore[attr-defined]
+    return np.asarray(middle[0] * frame.axis_u + middle[1] * frame.axis_v)  # type: ignore[attr-defined]
+
+
+def _key(own: Figures, contour: Contour) -> tuple[bytes, ...]:
+    return (
+        own.fit.inside.tobytes(),
+        np.float64(own.fit.offset_m).tobytes(),
+        np.float64(own.fit.sigma_n_m).tobytes(),
+        own.centroid.tobytes(),
+        repr((own.num_points, own.num_voxels, contour.rounded, own.sighting)).encode(),
+    )
+
+
+def _plane(
+    plane_id: int, revision: int, own: Figures, contour: Contour, surfaces: tuple[Surface, ...]
+) -> Plane:
+    fit = own.fit
+    return Plane(
+        id=plane_id,
+        revision=revision,
+        plane_class=fit.plane_class,
+        normal=fit.normal,
+        d=fit.d,
+        facing=fit.facing,
+        sigma_n_m=fit.sigma_n_m,
+        thickness_angle_deg=fit.thickness_angle_deg,
+        covariance=fit.covariance,
+        num_points=own.num_points,
+        num_voxels=own.num_voxels,
+        centroid=own.centroid,
+        rms_m=fit.sigma_n_m,
+        frame=contour.frame,
+        surfaces=surfaces,
+        first_seen_ns=own.sighting.first_ns,
+        last_seen_ns=own.sighting.last_ns,
+        robots=tuple(sorted(own.sighting.robots)),
+    )

@@ -1,0 +1,57 @@
+"""Principal variances and directions of symmetric 3x3 matrices, inside kernels."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+
+@njit(cache=True, nogil=True)
+def eigenvalues(a, b, c, d, e, f):  # type: ignore[no-untyped-def]
+    """Eigenvalues, descending, of [[a, d, e], [d, b, f], [e, f, c]] (Smith 1961, closed form)."""
+    q = (a + b + c) / 3.0
+    off = d * d + e * e + f * f
+    p2 = (a - q) * (a - q) + (b - q) * (b - q) + (c - q) * (c - q) + 2.0 * off
+    if p2 <= 1e-300:
+        return q, q, q
+    p = np.sqrt(p2 / 6.0)
+    aa, bb, cc = (a - q) / p, (b - q) / p, (c - q) / p
+    dd, ee, ff = d / p, e / p, f / p
+    half = 0.5 * (aa * (bb * cc - ff * ff) - dd * (dd * cc - ff * ee) + ee * (dd * ff - bb * ee))
+    angle = np.arccos(min(1.0, max(-1.0, half))) / 3.0
+    first = q + 2.0 * p * np.cos(angle)
+    third = q + 2.0 * p * np.cos(angle + 2.0943951023931953)
+    return first, 3.0 * q - first - third, third
+
+
+@njit(cache=True, nogil=True)
+def eigenvector(a, b, c, d, e, f, value):  # type: ignore[no-untyped-def]
+    """Unit eigenvector of the matrix above for a simple eigenvalue; (0, 0, 1) where none is clear."""
+    x0, y0, z0 = a - value, d, e
+    x1, y1, z1 = d, b - value, f
+    x2, y2, z2 = e, f, c - value
+    ux, uy, uz = y0 * z1 - z0 * y1, z0 * x1 - x0 * z1, x0 * y1 - y0 * x1
+    vx, vy, vz = y0 * z2 - z0 * y2, z0 * x2 - x0 * z2, x0 * y2 - y0 * x2
+    wx, wy, wz = y1 * z2 - z1 * y2, z1 * x2 - x1 * z2, x1 * y2 - y1 * x2
+    uu, vv, ww = (
+        ux * ux + uy * uy + uz * uz,
+        vx * vx + vy * vy + vz * vz,
+        wx * wx + wy * wy + wz * wz,
+    )
+    if vv > uu and vv >= ww:
+        ux, uy, uz, uu = vx, vy, vz, vv
+    elif ww > uu:
+        ux, uy, uz, uu = wx, wy, wz, ww
+    if uu <= 1e-280:
+        return 0.0, 0.0, 1.0
+    length = np.sqrt(uu)
+    return ux / length, uy / length, uz / length
+
+
+@njit(cache=True, nogil=True)
+def smallest(scatter):  # type: ignore[no-untyped-def]
+    """(variance, nx, ny, nz, middle, largest) of a scatter (xx, xy, xz, yy, yz, zz)."""
+    a, d, e, b, f, c = scatter[0], scatter[1], scatter[2], scatter[3], scatter[4], scatter[5]
+    first, second, third = eigenvalues(a, b, c, d, e, f)
+    nx, ny, nz = eigenvector(a, b, c, d, e, f, third)
+    return third, nx, ny, nz, second, first

@@ -1,0 +1,148 @@
+"""Free space: how many beams passed each coarse cell. Integer traversal, additive, undone exactly."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from facet.mapping.blocks import Int64Array, find, hash_key, pack, put, rehash, unpack
+from facet.mapping.quantise import Ticks
+from facet.mapping.settings import TICKS
+
+CELL = 4  # voxels per cell edge
+SHIFT = 12  # ticks to cells: 2^12 = CELL * TICKS
+BEAMS_OF = 8  # of a cloud's beams one in so many is followed, chosen by a hash of its end
+MOST_BLOCKS = 2048  # blocks that one beam can add at the most
+
+assert 1 << SHIFT == CELL * TICKS
+
+
+@njit(cache=True, nogil=True)
+def _count(table, counts, keys, num_blocks, i, j, k, sign):  # type: ignore[no-untyped-def]
+    """Add `sign` to a cell; returns the number of blocks."""
+    key = pack(i >> 3, j >> 3, k >> 3)
+    block = find(table[0], table[1], key)
+    if block < 0:
+        block = num_blocks
+        put(table[0], table[1], key, block)
+        keys[block] = key
+        num_blocks += 1
+    counts[block, (i & 7) + 8 * (j & 7) + 64 * (k & 7)] += sign
+    return num_blocks
+
+
+@njit(cache=True, nogil=True)
+def _pass(table, counts, keys, num_blocks, a, b, sign, ends):  # type: ignore[no-untyped-def]
+    """Count a beam from a to b (ticks) in every cell it passes; the last one only if nothing is
+    there (`ends` false). Amanatides & Woo 1987, in integers."""
+    i, j, k = a[0] >> SHIFT, a[1] >> SHIFT, a[2] >> SHIFT
+    ei, ej, ek = b[0] >> SHIFT, b[1] >> SHIFT, b[2] >> SHIFT
+    d0, d1, d2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    s0, s1, s2 = (1 if d0 > 0 else -1), (1 if d1 > 0 else -1), (1 if d2 > 0 else -1)
+    # distance to the next border along each axis, over the axis' length: compared crosswise
+    n0 = ((i + 1) << SHIFT) - a[0] if d0 > 0 else a[0] - (i << SHIFT) + 1
+    n1 = ((j + 1) << SHIFT) - a[1] if d1 > 0 else a[1] - (j << SHIFT) + 1
+    n2 = ((k + 1) << SHIFT) - a[2] if d2 > 0 else a[2] - (k << SHIFT) + 1
+    l0, l1, l2 = abs(d0), abs(d1), abs(d2)
+    steps = abs(ei - i) + abs(ej - j) + abs(ek - k)
+    for _ in range(steps):
+        num_blocks = _count(table, counts, keys, num_blocks, i, j, k, sign)
+        left0, left1, left2 = i != ei, j != ej, k != ek
+        first0 = left0 and (not left1 or n0 * l1 <= n1 * l0) and (not left2 or n0 * l2 <= n2 * l0)
+        if first0:
+            i += s0
+            n0 += 1 << SHIFT
+        elif left1 and (not left2 or n1 * l2 <= n2 * l1):
+            j += s1
+            n1 += 1 << SHIFT
+        else:
+            k += s2
+            n2 += 1 << SHIFT
+    if not ends:
+        num_blocks = _count(table, counts, keys, num_blocks, i, j, k, sign)
+    return num_blocks
+
+
+@njit(cache=True, nogil=True)
+def _pass_all(table, counts, keys, num_blocks, sensor, points, start, every, sign, ends):  # type: ignore[no-untyped-def]
+    """Follow the chosen beams from `start` on. Returns (next beam, number of blocks)."""
+    for p in range(start, points.shape[0]):
+        mixed = hash_key(
+            points[p, 0] * 73856093 ^ points[p, 1] * 19349663 ^ points[p, 2] * 83492791
+        )
+        if every > 1 and mixed % every != 0:
+            continue
+        if num_blocks + MOST_BLOCKS > counts.shape[0]:
+            return p, num_blocks
+        num_blocks = _pass(table, counts, keys, num_blocks, sensor, points[p], sign, ends)
+    return points.shape[0], num_blocks
+
+
+@njit(cache=True, nogil=True)
+def passed(table_keys, table_values, counts, points, least):  # type: ignore[no-untyped-def]
+    """(N,) whether the cell of each point (N, 3) ticks was passed by at least `least` beams."""
+    out = np.zeros(points.shape[0], np.bool_)
+    for p in range(points.shape[0]):
+        i, j, k = points[p, 0] >> SHIFT, points[p, 1] >> SHIFT, points[p, 2] >> SHIFT
+        block = find(table_keys, table_values, pack(i >> 3, j >> 3, k >> 3))
+        if block >= 0:
+            out[p] = counts[block, (i & 7) + 8 * (j & 7) + 64 * (k & 7)] >= least
+    return out
+
+
+class FreeSpace:
+    """Beam counts by cell of 4 voxels, in dense blocks of 8^3 cells."""
+
+    def __init__(self) -> None:
+        self._keys = np.zeros(2 * MOST_BLOCKS, np.int64)
+        self._counts = np.zeros((2 * MOST_BLOCKS, 512), np.int32)
+        self._table = rehash(self._keys, 0, 8 * MOST_BLOCKS)
+        self.num_blocks = 0
+
+    def insert(self, ticks: Ticks) -> None:
+        """Count a scan's beams."""
+        self._apply(ticks, 1)
+
+    def remove(self, ticks: Ticks) -> None:
+        """Take a scan's beams out again."""
+        self._apply(ticks, -1)
+
+    def passed(self, points: Int64Array, least: int) -> NDArray[np.bool_]:
+        """(N,) whether at least `least` beams passed the cell of each point (N, 3) ticks, world."""
+        return np.asarray(passed(*self._table, self._counts, points, least))
+
+    def cells(self) -> tuple[Int64Array, NDArray[np.int32]]:
+        """Keys (C,), ascending, and counts (C,) of the cells that were passed."""
+        block, local = np.nonzero(self._counts[: self.num_blocks])
+        keys = np.empty(len(block), np.int64)
+        _cell_keys(self._keys, block, local, keys)
+        order = np.argsort(keys)
+        return keys[order], self._counts[block, local][order]
+
+    def _apply(self, ticks: Ticks, sign: int) -> None:
+        every = BEAMS_OF if ticks.pose_hash < 0 else 1
+        for points, ends in ((ticks.points, True), (ticks.beams, False)):
+            done = 0
+            while done < len(points):
+                done, self.num_blocks = _pass_all(
+                    self._table, self._counts, self._keys, self.num_blocks, ticks.sensor,
+                    points, done, every, sign, ends,
+                )  # fmt: skip
+                if done < len(points):
+                    self._grow()
+
+    def _grow(self) -> None:
+        capacity = 2 * len(self._keys)
+        keys, counts = np.zeros(capacity, np.int64), np.zeros((capacity, 512), np.int32)
+        keys[: len(self._keys)], counts[: len(self._counts)] = self._keys, self._counts
+        self._keys, self._counts = keys, counts
+        self._table = rehash(keys, self.num_blocks, 4 * capacity)
+
+
+@njit(cache=True, nogil=True)
+def _cell_keys(block_keys, block, local, out):  # type: ignore[no-untyped-def]
+    for c in range(block.shape[0]):
+        i, j, k = unpack(block_keys[block[c]])
+        x, y, z = local[c] & 7, (local[c] >> 3) & 7, local[c] >> 6
+        out[c] = pack(8 * i + x, 8 * j + y, 8 * k + z)

@@ -1,0 +1,224 @@
+"""The map: scans in, updates out. `update` is the whole method, one stage a line."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from facet.mapping.blocks import pack, unpack
+from facet.mapping.census import Census, tile_points
+from facet.mapping.contours import ContourField
+from facet.mapping.describe import Describer, Figures
+from facet.mapping.digest import Digest, derived_digest, model_planes, state_digest
+from facet.mapping.fitting import fit_plane
+from facet.mapping.freespace import FreeSpace
+from facet.mapping.identity import Heritage, Identity
+from facet.mapping.merging import limits
+from facet.mapping.normals import NormalField
+from facet.mapping.patches import PatchField
+from facet.mapping.planes import FREE, PointFit, fit_points, group_planes, tabulate
+from facet.mapping.quantise import quantise
+from facet.mapping.report import MapCounts, StageReport
+from facet.mapping.settings import TICKS, MapSettings
+from facet.mapping.store import VoxelStore
+from facet.mapping.tiles import TileField
+from facet.mapping.witness import Witness
+from facet_protocol.messages import MapUpdate, Scan, TilePoints
+
+Timer = Callable[[str], None]
+TileIndex = tuple[int, int, int]
+Members = dict[int, list[tuple[int, int]]]  # plane id: its tile-planes (tile key, number)
+
+
+class Inserted(NamedTuple):
+    """What became of a scan's points."""
+
+    points_stored: int
+    rejected: dict[str, int]
+
+
+class Mapper:
+    """The planar map of one place: a pure function of the scans inserted and not retracted.
+
+    One owner, one thread. `insert` and `retract` take scans, `update` derives what they changed;
+    plane ids and events alone depend on when `update` is called (design 2)."""
+
+    def __init__(self, settings: MapSettings | None = None, map_id: str = "map") -> None:
+        self.settings = settings or MapSettings()
+        self.map_id = map_id
+        self.revision = 0
+        self.work: dict[str, int] = {}
+        self.changed_tiles: list[TileIndex] = []
+        self._store = VoxelStore()
+        self._free = FreeSpace()
+        self._normals = NormalField(self.settings)
+        self._patches = PatchField(self.settings)
+        self._tiles = TileField()
+        self._contours = ContourField(self.settings)
+        self._identity = Identity()
+        self._describer = Describer(self.settings)
+        self._witness = Witness()
+        self._census = Census()
+        self._table = tabulate({})
+        self._planes = group_planes(self._table, limits(self.settings, 0.0), self.settings)
+        self._stamp_ns = 0
+
+    def insert(self, scan: Scan) -> Inserted:
+        """Add a resolved scan. What cannot be mapped is counted, never lost in silence."""
+        ticks = quantise(scan, self.settings)
+        self._store.insert(ticks)
+        self._free.insert(ticks)
+        self._witness.note(ticks, scan)
+        self._census.count(scan, ticks, 1)
+        self._stamp_ns = max(self._stamp_ns, scan.stamp_ns)
+        return Inserted(len(ticks.points), ticks.rejected)
+
+    def retract(self, scan: Scan) -> None:
+        """Take a scan out again, exactly as if it had never been there (design 3.7)."""
+        ticks = quantise(scan, self.settings)
+        self._store.remove(ticks)
+        self._free.remove(ticks)
+        self._census.count(scan, ticks, -1)
+
+    def update(self, timer: Timer | None = None) -> MapUpdate:
+        """Derive everything that is stale. `timer` is told the name of each stage as it ends."""
+        done = timer or (lambda stage: None)
+        store = self._store
+        touched = store.touched_rows.copy()
+        dirty = store.settle()
+        done("settle")
+        stale, turned = self._normals.update(store, dirty)
+        done("normals")
+        regrouped, relabelled, summed = self._patches.update(
+            store, self._normals.normals, np.union1d(turned, dirty), touched
+        )
+        done("patches")
+        limit = limits(self.settings, self._patches.sigma() / TICKS)
+        moved = np.unique(store.columns.block[dirty])
+        grown, changed = self._tiles.update(
+            store, self._patches, limit, regrouped, relabelled, summed, moved
+        )
+        done("tiles")
+        self._table = tabulate(self._tiles.tiles)
+        self._planes = group_planes(self._table, limit, self.settings)
+        points = fit_points(self._table, self._planes, self.settings.voxel_m)
+        done("planes")
+        lineage = self._identity.assign(len(points.num_points), self._heritage())
+        members, renamed = self._name(lineage.ids)
+        figures = self._figures(lineage.ids, points, members)
+        done("identity")
+        self._contours.update(
+            store, self._tiles.tiles, set(changed),
+            {i: (figures[i].fit.inside, members[i]) for i in figures},
+        )  # fmt: skip
+        done("contours")
+        updated = self._describer.update(figures, self._contours.contours, self._free)
+        done("describe")
+        self.changed_tiles = [unpack(key) for key in sorted({*changed, *renamed})]
+        self.work = {
+            "touched_voxels": len(touched),
+            "dirty_voxels": len(dirty),
+            "stale_voxels": len(stale),
+            "blocks_regrouped": len(regrouped),
+            "blocks_relabelled": len(relabelled),
+            "tiles_regrouped": len(grown),
+            "tiles_changed": len(changed),
+            "tile_planes": len(self._planes.label),
+            "outline_tiles": self._contours.rolled,
+            "planes_changed": len(updated),
+        }
+        self.revision += 1
+        return MapUpdate(
+            map_id=self.map_id,
+            revision=self.revision,
+            base_revision=self.revision - 1,
+            stamp_ns=self._stamp_ns,
+            changed=tuple(self._describer[i] for i in updated),
+            retired=lineage.retired,
+            events=self._identity.events(lineage, updated, self.revision, self._stamp_ns),
+        )
+
+    def snapshot(self) -> MapUpdate:
+        """Everything, as of the last update."""
+        return MapUpdate(
+            self.map_id, self.revision, 0, self._stamp_ns, tuple(self._describer.planes), (), ()
+        )
+
+    def points(self, tiles: Iterable[TileIndex] | None = None) -> list[TilePoints]:
+        """The voxels of the tiles, or of all, as of the last update, for display."""
+        keys = sorted(self._tiles.tiles) if tiles is None else [pack(*index) for index in tiles]
+        return tile_points(
+            self._store, self._patches.patches, self._tiles, keys, self.settings.voxel_m
+        )
+
+    def counts(self) -> MapCounts:
+        """What was counted, and what the voxels are, as of the last update."""
+        return self._census.take(
+            self._store, self._normals.normals, self._tiles, self._patches.sigma()
+            / TICKS * self.settings.voxel_m,
+        )  # fmt: skip
+
+    def report(self) -> StageReport:
+        """The four-stage report of the paper's Table 3."""
+        stages, counts = self._planes.stages, self.counts()
+        voxels, points = max(1, counts.voxels), max(1, counts.points_stored)
+        return StageReport(
+            planes=(stages.seeds, stages.merged, stages.detailed, stages.final),
+            aligned_percent=100.0 * counts.aligned / voxels,
+            thick_percent=100.0 * counts.thick / voxels,
+            average_two_sigma_m=2.0 * stages.average_sigma * self.settings.voxel_m,
+            detail_level_reached=stages.detail_reached,
+            min_occupation=stages.min_occupation,
+            discarded_percent=100.0 * counts.discarded / voxels,
+            discarded_points_percent=100.0 * counts.discarded_points / points,
+        )
+
+    def digest(self) -> Digest:
+        """Hashes of the state and of what is derived from it, as of the last update."""
+        planes = model_planes(self._describer.planes)
+        return Digest(
+            state_digest(self._store, self._free),
+            derived_digest(planes, self.counts().as_dict()),
+        )
+
+    def _heritage(self) -> Heritage:
+        """Voxels that the planes of this update share with those of the last."""
+        old, plane, voxels = [], [], []
+        for index, key in enumerate(self._table.tile_keys.tolist()):
+            shared = self._tiles.tiles[key].heritage
+            label = self._planes.label[self._table.starts[index] + shared[:, 1]]
+            on = label != FREE
+            old.append(shared[on, 0])
+            plane.append(label[on])
+            voxels.append(shared[on, 2])
+        none = [np.zeros(0, np.int64)]
+        return Heritage(*(np.concatenate(none + part) for part in (old, plane, voxels)))
+
+    def _name(self, ids: NDArray[np.int64]) -> tuple[Members, list[int]]:
+        """Hand the plane ids to the tiles. Returns each plane's tile-planes, and renamed tiles."""
+        label, table = self._planes.label, self._table
+        named = np.where(label == FREE, 0, ids[label] if len(ids) else 0)
+        renamed = self._tiles.name(table.tile_keys, table.starts, named)
+        members: Members = {int(i): [] for i in ids}
+        numbers = np.arange(len(label)) - table.starts[table.tile_of]
+        keys = table.tile_keys[table.tile_of]
+        for node in np.flatnonzero(named):
+            members[int(named[node])].append((int(keys[node]), int(numbers[node])))
+        return members, renamed
+
+    def _figures(
+        self, ids: NDArray[np.int64], points: PointFit, members: Members
+    ) -> dict[int, Figures]:
+        tick_m = self.settings.tick_m
+        figures = {}
+        for plane, plane_id in enumerate(ids.tolist()):
+            num, centroid = int(points.num_points[plane]), points.centroid[plane]
+            unit = self._planes.nodes.unit[plane]
+            fit = fit_plane(num, centroid, points.scatter[plane], unit, tick_m)
+            seen = self._witness.of({key for key, _ in members[plane_id]})
+            voxels = int(self._planes.occupation[plane])
+            figures[plane_id] = Figures(fit, num, voxels, centroid, seen)
+        return figures

@@ -1,0 +1,211 @@
+"""Merging of planes by orientation and distance, on statistics alone (method.md 6.1, 6.3).
+
+A node is (votes, mean, scatter, unit): voxels, their centroid, their summed outer products about
+it, and the sum of their normals. Nodes merge along edges, best first; an edge that is refused is
+tried again until nothing changes. The order of edges is total, so the result is a pure function.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from facet.mapping.eigen import smallest
+from facet.mapping.settings import MapSettings
+
+TRUSTED = 30  # below this many voxels the mean normal is trusted more than the fit
+
+
+class Nodes(NamedTuple):
+    """Things to merge, as columns (T, ...). Lengths in voxels, about the map's origin."""
+
+    votes: NDArray[np.float64]  # (T,)
+    mean: NDArray[np.float64]  # (T, 3)
+    scatter: NDArray[np.float64]  # (T, 6) xx, xy, xz, yy, yz, zz about the mean
+    unit: NDArray[np.float64]  # (T, 3) sum of unit normals
+
+
+class Limits(NamedTuple):
+    """When two planes are one. Lengths in voxels."""
+
+    edge_cos: float  # of the nodes at the ends of an edge
+    cos: float
+    offset: float
+    variance: float
+    bridge_cos: float
+
+
+def limits(settings: MapSettings, sigma: float, angle_deg: float | None = None) -> Limits:
+    """Limits for a scene noise `sigma` in voxels."""
+    offset = min(max(settings.merge_sigmas * sigma, 0.5), 0.7)
+    return Limits(
+        edge_cos=math.cos(math.radians(settings.edge_angle_deg)),
+        cos=math.cos(math.radians(angle_deg or settings.merge_angle_deg)),
+        offset=offset,
+        variance=(settings.max_merged_sigma_m / settings.voxel_m) ** 2,
+        bridge_cos=math.cos(math.radians(settings.bridge_angle_deg)),
+    )
+
+
+@njit(cache=True, nogil=True)
+def plane_of(votes, scatter, unit):  # type: ignore[no-untyped-def]
+    """(nx, ny, nz, variance along it) of a node: the fit, or the mean normal of a small one."""
+    length = np.sqrt(unit[0] * unit[0] + unit[1] * unit[1] + unit[2] * unit[2])
+    nx, ny, nz = unit[0] / length, unit[1] / length, unit[2] / length
+    if votes >= TRUSTED:
+        total, fx, fy, fz, _, _ = smallest(scatter)
+        dot = fx * nx + fy * ny + fz * nz
+        if dot < 0.0:
+            fx, fy, fz = -fx, -fy, -fz
+        return fx, fy, fz, max(0.0, total) / votes
+    spread = (
+        scatter[0] * nx * nx + scatter[3] * ny * ny + scatter[5] * nz * nz
+        + 2.0 * (scatter[1] * nx * ny + scatter[2] * nx * nz + scatter[4] * ny * nz)
+    )  # fmt: skip
+    return nx, ny, nz, max(0.0, spread) / votes
+
+
+@njit(cache=True, nogil=True)
+def pool(va, ma, sa, vb, mb, sb, mean, scatter):  # type: ignore[no-untyped-def]
+    """P1, P2: mean and scatter of the union, written to the last two (Chan, Golub, LeVeque 1979)."""
+    total = va + vb
+    k = va * vb / total
+    d0, d1, d2 = mb[0] - ma[0], mb[1] - ma[1], mb[2] - ma[2]
+    scatter[0] = sa[0] + sb[0] + k * d0 * d0
+    scatter[1] = sa[1] + sb[1] + k * d0 * d1
+    scatter[2] = sa[2] + sb[2] + k * d0 * d2
+    scatter[3] = sa[3] + sb[3] + k * d1 * d1
+    scatter[4] = sa[4] + sb[4] + k * d1 * d2
+    scatter[5] = sa[5] + sb[5] + k * d2 * d2
+    f = vb / total
+    mean[0], mean[1], mean[2] = ma[0] + f * d0, ma[1] + f * d1, ma[2] + f * d2
+    return total
+
+
+@njit(cache=True, nogil=True)
+def _offset(normals, mean, a, b):  # type: ignore[no-untyped-def]
+    """Signed distance of b's centroid from a's plane."""
+    return (
+        normals[a, 0] * (mean[b, 0] - mean[a, 0])
+        + normals[a, 1] * (mean[b, 1] - mean[a, 1])
+        + normals[a, 2] * (mean[b, 2] - mean[a, 2])
+    )
+
+
+@njit(cache=True, nogil=True)
+def _dot(normals, a, b):  # type: ignore[no-untyped-def]
+    return (
+        normals[a, 0] * normals[b, 0]
+        + normals[a, 1] * normals[b, 1]
+        + normals[a, 2] * normals[b, 2]
+    )
+
+
+@njit(cache=True, nogil=True)
+def edge_costs(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-def]
+    """(E,) cost of merging along each edge; inf where its two ends disagree by themselves."""
+    normals = np.empty((votes.shape[0], 3))
+    for t in range(votes.shape[0]):
+        nx, ny, nz, _ = plane_of(votes[t], scatter[t], unit[t])
+        normals[t, 0], normals[t, 1], normals[t, 2] = nx, ny, nz
+    costs = np.empty(edges.shape[0])
+    for e in range(edges.shape[0]):
+        a, b = edges[e, 0], edges[e, 1]
+        if votes[b] > votes[a]:
+            a, b = b, a
+        cos = _dot(normals, a, b)
+        w = abs(_offset(normals, mean, a, b))
+        if cos < limit.edge_cos or w > limit.offset:
+            costs[e] = np.inf
+        else:
+            costs[e] = (1.0 - cos) / (1.0 - limit.edge_cos) + (w / limit.offset) ** 2
+    return costs
+
+
+@njit(cache=True, nogil=True)
+def _root(parent, t):  # type: ignore[no-untyped-def]
+    while parent[t] != t:
+        parent[t] = parent[parent[t]]
+        t = parent[t]
+    return t
+
+
+@njit(cache=True, nogil=True)
+def _try(votes, mean, scatter, unit, normals, a, b, limit, m, s, u):  # type: ignore[no-untyped-def]
+    """Whether a and b (a the larger) are one plane; m, s, u are then its statistics."""
+    if _dot(normals, a, b) < limit.cos:
+        return False
+    w = _offset(normals, mean, a, b)
+    if abs(w) > limit.offset:
+        return False
+    n = normals[a]
+    sb = scatter[b]
+    spread = (
+        sb[0] * n[0] * n[0] + sb[3] * n[1] * n[1] + sb[5] * n[2] * n[2]
+        + 2.0 * (sb[1] * n[0] * n[1] + sb[2] * n[0] * n[2] + sb[4] * n[1] * n[2])
+    ) / votes[b]  # fmt: skip
+    if spread + w * w > limit.offset * limit.offset:  # P4
+        return False
+    total = pool(votes[a], mean[a], scatter[a], votes[b], mean[b], sb, m, s)
+    u[0], u[1], u[2] = unit[a, 0] + unit[b, 0], unit[a, 1] + unit[b, 1], unit[a, 2] + unit[b, 2]
+    nx, ny, nz, variance = plane_of(total, s, u)
+    if variance > limit.variance:
+        return False
+    length = np.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
+    return (nx * u[0] + ny * u[1] + nz * u[2]) >= limit.bridge_cos * length
+
+
+@njit(cache=True, nogil=True)
+def merge(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-def]
+    """Merge nodes along edges (E, 2), given best first. The four statistics end as those of the
+    merged nodes, at the root's row. Returns (T,) the root of each node: its smallest member."""
+    count = votes.shape[0]
+    parent = np.arange(count)
+    version = np.zeros(count, np.int64)
+    normals = np.empty((count, 3))
+    for t in range(count):
+        nx, ny, nz, _ = plane_of(votes[t], scatter[t], unit[t])
+        normals[t, 0], normals[t, 1], normals[t, 2] = nx, ny, nz
+    m, s, u = np.zeros(3), np.zeros(6), np.zeros(3)
+    tried = np.full((edges.shape[0], 2), -1, np.int64)
+    merged = True
+    while merged:
+        merged = False
+        for e in range(edges.shape[0]):
+            a, b = _root(parent, edges[e, 0]), _root(parent, edges[e, 1])
+            if a == b or (tried[e, 0] == version[a] and tried[e, 1] == version[b]):
+                continue
+            tried[e, 0], tried[e, 1] = version[a], version[b]
+            large, small = (a, b) if votes[a] >= votes[b] else (b, a)
+            if not _try(votes, mean, scatter, unit, normals, large, small, limit, m, s, u):
+                continue
+            merged = True
+            keep, drop = min(a, b), max(a, b)
+            parent[drop] = keep
+            votes[keep] = votes[a] + votes[b]
+            mean[keep], scatter[keep], unit[keep] = m, s, u
+            nx, ny, nz, _ = plane_of(votes[keep], s, u)
+            normals[keep, 0], normals[keep, 1], normals[keep, 2] = nx, ny, nz
+            version[keep] = version[a] + version[b] + 1
+    for t in range(count):
+        parent[t] = _root(parent, t)
+    return parent
+
+
+def merge_nodes(
+    nodes: Nodes, edges: NDArray[np.int64], limit: Limits
+) -> tuple[NDArray[np.int64], Nodes]:
+    """Merge `nodes` along `edges` (E, 2), which must come in a canonical order.
+
+    Returns (root of each node (T,), statistics with the merged ones at the roots' rows)."""
+    merged = Nodes(*(column.copy() for column in nodes))
+    if not len(edges):
+        return np.arange(len(nodes.votes)), merged
+    costs = edge_costs(*nodes, edges, limit)
+    order = np.argsort(costs, kind="stable")
+    order = order[np.isfinite(costs[order])]
+    return merge(*merged, np.ascontiguousarray(edges[order]), limit), merged

@@ -1,0 +1,420 @@
+"""Patches: inside a block, valid voxels with like normals and offsets; leftovers join a neighbour.
+
+Grouping reads observables only (rounded centroids, one vote a voxel, rounded normals). Beside it a
+patch carries the exact moments of its members' points, for fitting, and their spread as a rung.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from facet.mapping.bits import trailing_zeros
+from facet.mapping.blocks import CENTRE
+from facet.mapping.eigen import smallest
+from facet.mapping.normals import VALID, Normals
+from facet.mapping.settings import STEPS, TICKS, MapSettings
+from facet.mapping.store import MOMENTS, VoxelStore
+
+PER_BLOCK = 12  # patches of a block; what finds no place is a leftover
+RUNGS = 40
+RUNG_STEP = 1.2  # a rung of sigma_N is 20 % wide
+FIRST_RUNG = 0.02 * 1024  # ticks: the lowest rung ends here (1 mm at 5 cm voxels)
+LEFTOVER_REACH = 8  # voxels between a leftover and the box of the patch it joins
+CORNER_COS = 0.8  # planes that share a corner voxel differ by more than 37 degrees
+
+
+class Patches(NamedTuple):
+    """Patches by block and index (B, PER_BLOCK, ...), and labels by voxel row (V,)."""
+
+    count: NDArray[np.int8]  # (B,) patches of a block
+    votes: NDArray[np.int32]  # member voxels
+    centroid: NDArray[np.int32]  # (.., 3) sum of rounded centroids, 1/8 voxel from the block corner
+    scatter: NDArray[np.int64]  # (.., 6) sum of their products xx, xy, xz, yy, yz, zz
+    unit: NDArray[np.int32]  # (.., 3) sum of the members' normals, times UNIT
+    box: NDArray[np.int8]  # (.., 6) least and largest local x, y, z of the members
+    points: NDArray[
+        np.int64
+    ]  # (.., 10) exact moments of the members' points, ticks from the corner
+    rung: NDArray[np.int8]  # of sigma_N
+    counted: NDArray[np.int32]  # votes that stand in the histogram of rungs
+    member: NDArray[np.int8]  # (V,) index of the patch that a valid voxel belongs to, -1: none
+    label: NDArray[np.int16]  # (V,) 16 * neighbour + index: the patch that a voxel goes with
+    second: NDArray[np.int16]  # (V,) another patch, at an angle, that claims a corner voxel
+
+
+class Grouping(NamedTuple):
+    """Tolerances, from theta and the voxel alone."""
+
+    cos_angle: float
+    offset: float  # 1/8 voxels, of a member from its patch
+    leftover: float  # 1/8 voxels, of a leftover from its patch
+
+
+def empty_patches() -> Patches:
+    shape = (0, PER_BLOCK)
+    return Patches(
+        count=np.zeros(0, np.int8),
+        votes=np.zeros(shape, np.int32),
+        centroid=np.zeros((*shape, 3), np.int32),
+        scatter=np.zeros((*shape, 6), np.int64),
+        unit=np.zeros((*shape, 3), np.int32),
+        box=np.zeros((*shape, 6), np.int8),
+        points=np.zeros((*shape, MOMENTS), np.int64),
+        rung=np.zeros(shape, np.int8),
+        counted=np.zeros(shape, np.int32),
+        member=np.zeros(0, np.int8),
+        label=np.zeros(0, np.int16),
+        second=np.zeros(0, np.int16),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _join(votes, centroid, unit, count, c, n, grouping):  # type: ignore[no-untyped-def]
+    """Index of the patch that takes a voxel at c (eighths) with normal n; -1: none."""
+    best, best_cost = -1, 2.0
+    for p in range(count):
+        ux, uy, uz = float(unit[p, 0]), float(unit[p, 1]), float(unit[p, 2])
+        length = np.sqrt(ux * ux + uy * uy + uz * uz)
+        own = np.sqrt(float(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]))
+        cos = (ux * n[0] + uy * n[1] + uz * n[2]) / (length * own)
+        if cos < grouping.cos_angle:
+            continue
+        v = float(votes[p])
+        dx, dy, dz = c[0] - centroid[p, 0] / v, c[1] - centroid[p, 1] / v, c[2] - centroid[p, 2] / v
+        w = (ux * dx + uy * dy + uz * dz) / length
+        if abs(w) > grouping.offset:
+            continue
+        cost = (1.0 - cos) / (1.0 - grouping.cos_angle) + (w / grouping.offset) ** 2
+        if cost < best_cost:
+            best, best_cost = p, cost
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _group(blocks, observable, normals, patches, block, grouping, scratch):  # type: ignore[no-untyped-def]
+    """Group a block's valid voxels, best thickness angle first. Returns whether anything changed."""
+    votes, centroid, scatter, unit, box, label = scratch
+    votes[:] = 0
+    centroid[:] = 0
+    scatter[:] = 0
+    unit[:] = 0
+    order = np.empty(512, np.int32)
+    num = 0
+    for z in range(8):
+        word = blocks.occupied[block, z]
+        while word != np.uint64(0):
+            bit = np.int64(trailing_zeros(word))
+            word &= word - np.uint64(1)
+            row = blocks.rows[block, 64 * z + bit]
+            if normals.kind[row] == VALID:
+                order[num] = (np.int32(normals.thickness[row]) << 9) | (64 * z + bit)
+                num += 1
+    ordered = np.sort(order[:num])
+    label[:] = -1
+    count = 0
+    c = np.zeros(3, np.int64)
+    n = np.zeros(3, np.int64)
+    for o in range(num):
+        local = ordered[o] & 511
+        row = blocks.rows[block, local]
+        seen = observable[row]
+        x, y, z = local & 7, (local >> 3) & 7, local >> 6
+        c[0], c[1], c[2] = (
+            8 * x + (seen & 15),
+            8 * y + ((seen >> 4) & 15),
+            8 * z + ((seen >> 8) & 15),
+        )
+        n[0], n[1], n[2] = normals.unit[row, 0], normals.unit[row, 1], normals.unit[row, 2]
+        p = _join(votes, centroid, unit, count, c, n, grouping)
+        if p < 0:
+            if count == PER_BLOCK:
+                continue
+            p = count
+            count += 1
+            box[p, :3] = 8
+            box[p, 3:] = -1
+        label[local] = p
+        votes[p] += 1
+        s = 0
+        for a in range(3):
+            centroid[p, a] += c[a]
+            unit[p, a] += n[a]
+            for b in range(a, 3):
+                scatter[p, s] += c[a] * c[b]
+                s += 1
+        box[p, 0], box[p, 1], box[p, 2] = min(box[p, 0], x), min(box[p, 1], y), min(box[p, 2], z)
+        box[p, 3], box[p, 4], box[p, 5] = max(box[p, 3], x), max(box[p, 4], y), max(box[p, 5], z)
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _store(blocks, patches, block, count, scratch):  # type: ignore[no-untyped-def]
+    """Write a block's grouping. Returns whether it differs from what was there."""
+    votes, centroid, scatter, unit, box, label = scratch
+    changed = patches.count[block] != count
+    patches.count[block] = count
+    for p in range(count):
+        if patches.votes[block, p] != votes[p]:
+            changed = True
+        patches.votes[block, p] = votes[p]
+        for a in range(3):
+            if (
+                patches.centroid[block, p, a] != centroid[p, a]
+                or patches.unit[block, p, a] != unit[p, a]
+            ):
+                changed = True
+            patches.centroid[block, p, a] = centroid[p, a]
+            patches.unit[block, p, a] = unit[p, a]
+        for a in range(6):
+            if (
+                patches.scatter[block, p, a] != scatter[p, a]
+                or patches.box[block, p, a] != box[p, a]
+            ):
+                changed = True
+            patches.scatter[block, p, a] = scatter[p, a]
+            patches.box[block, p, a] = box[p, a]
+    for local in range(512):
+        row = blocks.rows[block, local]
+        if row >= 0 and patches.member[row] != label[local]:
+            patches.member[row] = label[local]
+            changed = True
+    return changed
+
+
+@njit(cache=True, nogil=True)
+def _group_blocks(blocks, observable, normals, patches, which, grouping, changed):  # type: ignore[no-untyped-def]
+    scratch = (
+        np.zeros(PER_BLOCK, np.int64),
+        np.zeros((PER_BLOCK, 3), np.int64),
+        np.zeros((PER_BLOCK, 6), np.int64),
+        np.zeros((PER_BLOCK, 3), np.int64),
+        np.zeros((PER_BLOCK, 6), np.int64),
+        np.zeros(512, np.int64),
+    )
+    for q in range(which.shape[0]):
+        count = _group(blocks, observable, normals, patches, which[q], grouping, scratch)
+        changed[q] = _store(blocks, patches, which[q], count, scratch)
+
+
+@njit(cache=True, nogil=True)
+def _distance(patches, block, p, c, v, mixed):  # type: ignore[no-untyped-def]
+    """(distance to the patch's plane, gap to its box), eighths, of a leftover at c (eighths, from
+    that block's corner) seen from v; (1e9, 0) where the patch faces away or is out of reach."""
+    ux, uy, uz = patches.unit[block, p]
+    if not mixed and ux * v[0] + uy * v[1] + uz * v[2] <= 0:
+        return 1e9, 0
+    gap = 0
+    for a in range(3):
+        low = 8 * np.int64(patches.box[block, p, a])
+        high = 8 * np.int64(patches.box[block, p, a + 3]) + 8
+        gap = max(gap, low - c[a], c[a] - high)
+    if gap > 8 * LEFTOVER_REACH:
+        return 1e9, 0
+    votes = float(patches.votes[block, p])
+    w = (
+        ux * (c[0] - patches.centroid[block, p, 0] / votes)
+        + uy * (c[1] - patches.centroid[block, p, 1] / votes)
+        + uz * (c[2] - patches.centroid[block, p, 2] / votes)
+    ) / np.sqrt(float(ux) * ux + float(uy) * uy + float(uz) * uz)
+    return abs(w), gap
+
+
+@njit(cache=True, nogil=True)
+def _nearest(blocks, patches, block, local, seen, grouping, avoid):  # type: ignore[no-untyped-def]
+    """(label, block, index) of the best patch for a leftover, none of them within 37 degrees of
+    the direction `avoid` (unless that is zero); label -1: none."""
+    c = np.empty(3, np.int64)
+    v = np.empty(3, np.int64)
+    for a in range(3):
+        v[a] = ((seen >> (16 + 5 * a)) & 31) - 8
+    mixed = ((seen >> 31) & 1) == 1
+    avoid_norm = np.sqrt(avoid[0] ** 2 + avoid[1] ** 2 + avoid[2] ** 2)
+    best, best_cost, best_block, best_p = -1, 1e9, -1, -1
+    for n in range(27):
+        other = block if n == CENTRE else blocks.neighbours[block, n]
+        if other < 0:
+            continue
+        c[0] = 8 * ((local & 7) - 8 * (n % 3 - 1)) + (seen & 15)
+        c[1] = 8 * (((local >> 3) & 7) - 8 * ((n // 3) % 3 - 1)) + ((seen >> 4) & 15)
+        c[2] = 8 * ((local >> 6) - 8 * (n // 9 - 1)) + ((seen >> 8) & 15)
+        for p in range(patches.count[other]):
+            w, gap = _distance(patches, other, p, c, v, mixed)
+            if w > grouping.leftover:
+                continue
+            if avoid_norm > 0.0:
+                ux, uy, uz = patches.unit[other, p]
+                norm = avoid_norm * np.sqrt(float(ux) * ux + float(uy) * uy + float(uz) * uz)
+                if ux * avoid[0] + uy * avoid[1] + uz * avoid[2] > CORNER_COS * norm:
+                    continue
+            cost = (w / grouping.leftover) ** 2 + (max(gap, 0) / (8.0 * LEFTOVER_REACH)) ** 2
+            cost += 1.0 / (1.0 + patches.votes[other, p])
+            if cost < best_cost:
+                best, best_cost, best_block, best_p = 16 * n + p, cost, other, p
+    return best, best_block, best_p
+
+
+@njit(cache=True, nogil=True)
+def _label_blocks(blocks, observable, patches, which, grouping, changed):  # type: ignore[no-untyped-def]
+    """Label every voxel of the blocks `which` again; mark the blocks where a label changed."""
+    avoid = np.zeros(3)
+    for q in range(which.shape[0]):
+        block = which[q]
+        for local in range(512):
+            row = blocks.rows[block, local]
+            if row < 0:
+                continue
+            seen = observable[row]
+            label, second = -1, -1
+            if patches.member[row] >= 0:
+                label = 16 * CENTRE + patches.member[row]
+            elif seen != 0:
+                avoid[:] = 0.0
+                label, b, p = _nearest(blocks, patches, block, local, seen, grouping, avoid)
+                if label >= 0:
+                    for a in range(3):
+                        avoid[a] = patches.unit[b, p, a]
+                    second, b, p = _nearest(blocks, patches, block, local, seen, grouping, avoid)
+            if patches.label[row] != label or patches.second[row] != second:
+                patches.label[row] = label
+                patches.second[row] = second
+                changed[q] = True
+
+
+@njit(cache=True, nogil=True)
+def _sum_points(blocks, moments, patches, which, rungs, histogram):  # type: ignore[no-untyped-def]
+    """Exact moments of the members' points about the block corner, and the rung of sigma_N."""
+    m = np.zeros((PER_BLOCK, MOMENTS), np.int64)
+    spread = np.zeros(6)
+    for q in range(which.shape[0]):
+        block = which[q]
+        m[:] = 0
+        for z in range(8):
+            word = blocks.occupied[block, z]
+            while word != np.uint64(0):
+                bit = np.int64(trailing_zeros(word))
+                word &= word - np.uint64(1)
+                row = blocks.rows[block, 64 * z + bit]
+                p = patches.member[row]
+                if p < 0:
+                    continue
+                own = moments[row]
+                n = own[0]
+                d = (TICKS * (bit & 7), TICKS * (bit >> 3), TICKS * z)
+                s = 4
+                for a in range(3):
+                    for b in range(a, 3):
+                        m[p, s] += own[s] + d[a] * own[1 + b] + d[b] * own[1 + a] + n * d[a] * d[b]
+                        s += 1
+                for a in range(3):
+                    m[p, 1 + a] += own[1 + a] + n * d[a]
+                m[p, 0] += n
+        for p in range(PER_BLOCK):
+            votes = patches.counted[block, p]
+            if votes > 0:
+                histogram[patches.rung[block, p]] -= votes
+            patches.counted[block, p] = 0
+            if p >= patches.count[block]:
+                continue
+            patches.points[block, p] = m[p]
+            n = float(m[p, 0])
+            s = 0
+            for a in range(3):
+                for b in range(a, 3):
+                    spread[s] = m[p, 4 + s] / n - (m[p, 1 + a] / n) * (m[p, 1 + b] / n)
+                    s += 1
+            variance = smallest(spread)[0]
+            rung = 0
+            while rung < RUNGS - 1 and variance > rungs[rung]:
+                rung += 1
+            patches.rung[block, p] = rung
+            patches.counted[block, p] = patches.votes[block, p]
+            histogram[rung] += patches.votes[block, p]
+
+
+@njit(cache=True, nogil=True)
+def _dilate(blocks, which, flags, out):  # type: ignore[no-untyped-def]
+    """Each of the blocks and of their 26 neighbours, once. Returns how many."""
+    count = 0
+    for q in range(which.shape[0]):
+        for n in range(27):
+            other = which[q] if n == CENTRE else blocks.neighbours[which[q], n]
+            if other >= 0 and not flags[other]:
+                flags[other] = True
+                out[count] = other
+                count += 1
+    for q in range(count):
+        flags[out[q]] = False
+    return count
+
+
+class PatchField:
+    """Patches of all blocks, kept true by grouping dirty blocks again."""
+
+    def __init__(self, settings: MapSettings) -> None:
+        self._grouping = Grouping(
+            cos_angle=math.cos(math.radians(settings.patch_angle_deg)),
+            offset=settings.patch_offset * STEPS,
+            leftover=settings.leftover_offset * STEPS,
+        )
+        self.patches = empty_patches()
+        self.histogram = np.zeros(RUNGS, np.int64)  # voxels by the rung of their patch
+        self.rungs = (FIRST_RUNG * RUNG_STEP ** np.arange(RUNGS)) ** 2  # upper limits, ticks^2
+        self._flags = np.zeros(0, np.bool_)
+
+    def update(
+        self,
+        store: VoxelStore,
+        normals: Normals,
+        changed_rows: NDArray[np.int32],
+        touched_rows: NDArray[np.int32],
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+        """Group the blocks of `changed_rows` again (normals or observables changed) and sum the
+        points of the blocks of `touched_rows`.
+
+        Returns blocks: (patches changed), (labels changed), (point moments changed)."""
+        self._fit(store)
+        block_of = store.columns.block
+        dirty = np.unique(block_of[changed_rows])
+        changed = np.empty(len(dirty), np.bool_)
+        _group_blocks(
+            store.blocks, store.columns.observable, normals, self.patches, dirty,
+            self._grouping, changed,
+        )  # fmt: skip
+        regrouped = dirty[changed]
+        near = np.empty(store.num_blocks, np.int32)
+        count = _dilate(store.blocks, regrouped, self._flags, near)
+        near = np.union1d(near[:count], dirty)
+        relabelled = np.zeros(len(near), np.bool_)
+        _label_blocks(
+            store.blocks, store.columns.observable, self.patches, near, self._grouping, relabelled
+        )
+        touched = np.union1d(block_of[touched_rows], regrouped)
+        _sum_points(
+            store.blocks, store.columns.moments, self.patches, touched, self.rungs, self.histogram
+        )
+        return regrouped, near[relabelled], touched
+
+    def sigma(self) -> float:
+        """Noise of the scene, ticks: the median over member voxels of their patch's rung."""
+        total = int(self.histogram.sum())
+        if total == 0:
+            return FIRST_RUNG
+        rung = int(np.searchsorted(np.cumsum(self.histogram), (total + 1) // 2))
+        return float(np.sqrt(self.rungs[rung] / RUNG_STEP))
+
+    def _fit(self, store: VoxelStore) -> None:
+        blocks, rows = len(store.blocks.keys), len(store.columns.block)
+        if len(self._flags) < blocks or len(self.patches.label) < rows:
+            self._flags = np.zeros(blocks, np.bool_)
+            grown = []
+            for name, column in zip(Patches._fields, self.patches, strict=True):
+                by_voxel = name in ("member", "label", "second")
+                more = (rows if by_voxel else blocks) - len(column)
+                fill = np.full((more, *column.shape[1:]), -1 if by_voxel else 0, column.dtype)
+                grown.append(np.concatenate([column, fill]))
+            self.patches = Patches(*grown)

@@ -1,0 +1,137 @@
+"""Boundary of the alpha complex of grid points, by rolling a disc round every point.
+
+A directed edge p -> q is on the boundary where the disc of radius alpha through both, on the right
+of the edge, holds no point (Edelsbrunner, Kirkpatrick & Seidel 1983: p and q are alpha-exposed).
+That depends on points within 2 alpha of p alone, so a tile with that halo gives exactly the edges
+of the whole. The squared radius is chosen so that no three grid points lie on one such circle
+(settings.ALPHA2): there are no ties, and angles in float64 decide every test rightly.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from facet.mapping.bits import trailing_zeros
+from facet.mapping.settings import ALPHA2
+
+CELLS = 64  # cells of a (u, v) tile's edge; a cell is one voxel, 8 x 8 grid points, one word
+HALO = 11  # cells: a point within 2 alpha is at most so far away
+SPAN = math.isqrt(4 * ALPHA2)  # largest coordinate difference within 2 alpha
+_FULL = 2.0 * math.pi
+
+
+def _tables() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """By (dv, du) + SPAN: where the arc of disc centres that hold the point begins and how long it
+    is (negative: out of reach). And the cells round a cell, nearest first, as (dv, du)."""
+    d = np.arange(-SPAN, SPAN + 1, dtype=np.float64)
+    dv, du = np.meshgrid(d, d, indexing="ij")
+    distance2 = du * du + dv * dv
+    inside = (distance2 > 0) & (distance2 < 4 * ALPHA2)
+    half = np.arccos(np.where(inside, np.sqrt(distance2) / (2.0 * math.sqrt(ALPHA2)), 0.0))
+    begin = np.mod(np.arctan2(dv, du) - half, _FULL)
+    length = np.where(inside, 2.0 * half, -1.0)
+    c = np.arange(-HALO, HALO + 1)
+    cv, cu = (a.ravel() for a in np.meshgrid(c, c, indexing="ij"))
+    gap = np.maximum(np.abs(cv) - 1, 0) ** 2 + np.maximum(np.abs(cu) - 1, 0) ** 2
+    near = gap * 64 < 4 * ALPHA2
+    order = np.argsort((cv**2 + cu**2)[near], kind="stable")
+    return begin, length, np.stack([cv[near], cu[near]], axis=1)[order].astype(np.int64)
+
+
+_BEGIN, _LENGTH, _AROUND = _tables()
+
+
+@njit(cache=True, nogil=True)
+def _cut(gaps, ends, count, begin, length, q):  # type: ignore[no-untyped-def]
+    """Take the open arc [begin, begin + length) out of the gaps (start, stop); ends holds the
+    points that bound each gap. Returns how many gaps are left."""
+    if count < 0:  # the first point: the rest of the circle is the only gap
+        gaps[0, 0], gaps[0, 1] = begin + length, begin + _FULL
+        ends[0, 0], ends[0, 1] = q, q
+        return 1
+    for turn in range(-1, 2):
+        low = begin + turn * _FULL
+        high = low + length
+        g = 0
+        while g < count:
+            start, stop = gaps[g, 0], gaps[g, 1]
+            if low >= stop or high <= start:
+                g += 1
+            elif low <= start and high >= stop:
+                count -= 1
+                gaps[g], ends[g] = gaps[count], ends[count]
+            elif low <= start:
+                gaps[g, 0], ends[g, 0] = high, q
+                g += 1
+            elif high >= stop:
+                gaps[g, 1], ends[g, 1] = low, q
+                g += 1
+            else:
+                gaps[count, 0], gaps[count, 1] = high, stop
+                ends[count, 0], ends[count, 1] = q, ends[g, 1]
+                gaps[g, 1], ends[g, 1] = low, q
+                count += 1
+                g += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _roll(window, begin, length, around, edges):  # type: ignore[no-untyped-def]
+    """Edges (u, v, u', v') that start in the window's middle tile, grid units from the tile's
+    corner. Returns how many, or -1 where `edges` is too short."""
+    gaps = np.empty((64, 2))
+    ends = np.empty((64, 2), np.int64)
+    num = 0
+    for row in range(CELLS):
+        for column in range(CELLS):
+            word = window[row + HALO, column + HALO]
+            while word != np.uint64(0):
+                bit = np.int64(trailing_zeros(word))
+                word &= word - np.uint64(1)
+                pu, pv = bit & 7, bit >> 3
+                count = -1
+                for a in range(around.shape[0]):
+                    dv, du = around[a, 0], around[a, 1]
+                    near = window[row + HALO + dv, column + HALO + du]
+                    while near != np.uint64(0):
+                        b = np.int64(trailing_zeros(near))
+                        near &= near - np.uint64(1)
+                        x = 8 * du + (b & 7) - pu
+                        y = 8 * dv + (b >> 3) - pv
+                        if abs(x) > SPAN or abs(y) > SPAN:
+                            continue
+                        arc = length[y + SPAN, x + SPAN]
+                        if arc > 0.0:
+                            q = (y + SPAN) * 1024 + (x + SPAN)
+                            count = _cut(gaps, ends, count, begin[y + SPAN, x + SPAN], arc, q)
+                            if count == 0:
+                                break
+                    if count == 0:
+                        break
+                if num + max(count, 0) > edges.shape[0]:
+                    return -1
+                for g in range(max(count, 0)):
+                    q = ends[g, 1]
+                    u, v = 8 * column + pu, 8 * row + pv
+                    edges[num, 0], edges[num, 1] = u, v
+                    edges[num, 2] = u + (q & 1023) - SPAN
+                    edges[num, 3] = v + (q >> 10) - SPAN
+                    num += 1
+    return num
+
+
+def boundary_edges(window: NDArray[np.uint64]) -> NDArray[np.int32]:
+    """(E, 4) edges (u, v, u', v') that start in the middle tile of a window of cells.
+
+    window: (CELLS + 2 HALO)^2 words, a bit u + 8 v for each grid point of a cell, rows by v."""
+    room = 1024
+    while True:
+        edges = np.empty((room, 4), np.int32)
+        count = int(_roll(window, _BEGIN, _LENGTH, _AROUND, edges))
+        if count >= 0:
+            return edges[:count].copy()
+        room *= 4

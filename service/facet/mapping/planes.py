@@ -1,0 +1,259 @@
+"""Planes: the paper's four stages, run whole over the tile-planes at every update (Table 3).
+
+Local normals and patches have made tile-planes (stage 1). Here similar ones merge where they touch
+(stage 2), the detail level drops what holds too little (stage 3), and what is left is consolidated:
+planes merge across gaps, freed tile-planes are offered to the survivors (stage 4).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from facet.mapping.blocks import unpack_all
+from facet.mapping.merging import Limits, Nodes, merge_nodes, plane_of, pool
+from facet.mapping.settings import TICKS, TILE, MapSettings
+from facet.mapping.tiles import Tile
+
+FREE = -1
+
+
+class Table(NamedTuple):
+    """All tile-planes in canonical order: by tile key, then by their order in the tile."""
+
+    tile_keys: NDArray[np.int64]  # (L,) ascending
+    starts: NDArray[np.int64]  # (L + 1,) first node of each tile
+    nodes: Nodes  # (T, ...)
+    occupation: NDArray[np.int64]  # (T,) voxels
+    edges: NDArray[np.int64]  # (E, 2) adjacent nodes, ascending
+    points: NDArray[np.int64]  # (T, 10) exact point moments about the tile corner
+    tile_of: NDArray[np.int64]  # (T,) index into tile_keys
+
+
+@dataclass(slots=True)
+class Stages:
+    """What each stage left behind, for the report."""
+
+    seeds: int = 0
+    merged: int = 0
+    detailed: int = 0
+    final: int = 0
+    average_sigma: float = 0.0  # voxel-weighted over the merged planes, voxels
+    detail_reached: float = 1.0
+    min_occupation: int = 0
+
+
+@dataclass(slots=True)
+class PlaneSet:
+    """Planes over the nodes of a table; K planes in canonical order."""
+
+    label: NDArray[np.int64]  # (T,) plane of each node, FREE: remainder
+    core: NDArray[np.bool_]  # (T,) it took part in the fit (not adopted in stage 4)
+    nodes: Nodes  # (K, ...) statistics of the voxels
+    occupation: NDArray[np.int64]  # (K,) voxels
+    stages: Stages
+
+
+def tabulate(tiles: dict[int, Tile]) -> Table:
+    """Concatenate the tiles."""
+    keys = np.array(sorted(k for k, t in tiles.items() if t.num_planes), np.int64)
+    ordered = [tiles[int(k)] for k in keys]
+    counts = np.array([t.num_planes for t in ordered], np.int64)
+    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    if not ordered:
+        none = Nodes(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 6)), np.zeros((0, 3)))
+        empty = np.zeros(0, np.int64)
+        return Table(
+            keys, starts, none, empty, empty.reshape(0, 2), np.zeros((0, 10), np.int64), empty
+        )
+    nodes = Nodes(*(np.concatenate(c) for c in zip(*(t.nodes for t in ordered), strict=True)))
+    pairs = np.concatenate([t.pairs for t in ordered])
+    own = np.repeat(starts[:-1], [len(t.pairs) for t in ordered]) + pairs[:, 0]
+    other = starts[np.searchsorted(keys, pairs[:, 1])] + pairs[:, 2]
+    return Table(
+        keys,
+        starts,
+        nodes,
+        np.concatenate([t.occupation for t in ordered]),
+        np.stack([own, other], axis=1),
+        np.concatenate([t.points for t in ordered]),
+        np.repeat(np.arange(len(ordered)), counts),
+    )
+
+
+def group_planes(table: Table, limit: Limits, settings: MapSettings) -> PlaneSet:
+    """Stages 2 to 4 over a table of tile-planes."""
+    stages = Stages(seeds=len(table.nodes.votes))
+    roots, merged = merge_nodes(table.nodes, table.edges, limit)
+    label, nodes = _relabel(roots, merged)
+    occupation = _occupation(label, table, len(nodes.votes))
+    stages.merged = len(nodes.votes)
+    stages.average_sigma = _average_sigma(nodes)
+
+    keep, least, stages.detail_reached = detail_level(occupation, settings)
+    stages.min_occupation = least
+    stages.detailed = int(keep.sum())
+    label, nodes = _drop(label, nodes, keep)
+
+    every = np.argwhere(np.triu(np.ones((len(nodes.votes),) * 2, np.bool_), 1)).astype(np.int64)
+    tight = limit._replace(edge_cos=limit.bridge_cos)
+    roots, merged = merge_nodes(nodes, every, tight)
+    into, nodes = _relabel(roots, merged)
+    label = np.where(label == FREE, FREE, into[label]) if len(into) else label
+    core = label != FREE
+    label = _adopt(table, label, nodes, limit)
+    occupation = _occupation(label, table, len(nodes.votes))
+    stages.final = len(nodes.votes)
+    return PlaneSet(label, core, nodes, occupation, stages)
+
+
+def detail_level(
+    occupation: NDArray[np.int64], settings: MapSettings
+) -> tuple[NDArray[np.bool_], int, float]:
+    """C7: the smallest set of planes that holds the detail level's share of the occupied voxels.
+
+    Returns (kept (K,), minimum occupation, share reached)."""
+    total = int(occupation.sum())
+    if total == 0:
+        return np.zeros(len(occupation), np.bool_), 0, 1.0
+    order = np.argsort(-occupation, kind="stable")
+    shares = np.cumsum(occupation[order]) / total
+    count = int(np.searchsorted(shares, settings.detail_level - 1e-12)) + 1
+    least = int(occupation[order[min(count, len(order)) - 1]])
+    least = min(least, int(settings.min_area_m2 / settings.voxel_m**2))
+    keep = occupation >= max(1, least)
+    return keep, least, float(occupation[keep].sum() / total)
+
+
+def _relabel(roots: NDArray[np.int64], merged: Nodes) -> tuple[NDArray[np.int64], Nodes]:
+    kept, label = np.unique(roots, return_inverse=True)
+    return label.astype(np.int64), Nodes(*(np.ascontiguousarray(c[kept]) for c in merged))
+
+
+def _drop(
+    label: NDArray[np.int64], nodes: Nodes, keep: NDArray[np.bool_]
+) -> tuple[NDArray[np.int64], Nodes]:
+    new = np.where(keep, np.cumsum(keep) - 1, FREE)
+    return new[label] if len(new) else label, Nodes(*(np.ascontiguousarray(c[keep]) for c in nodes))
+
+
+def _occupation(label: NDArray[np.int64], table: Table, count: int) -> NDArray[np.int64]:
+    on = label != FREE
+    return np.bincount(label[on], table.occupation[on], minlength=count).astype(np.int64)
+
+
+def _average_sigma(nodes: Nodes) -> float:
+    """Mean over planes of sigma_N, weighted by their voxels."""
+    if not len(nodes.votes):
+        return 0.0
+    sigmas = [
+        np.sqrt(plane_of(v, s, u)[3])
+        for v, s, u in zip(nodes.votes, nodes.scatter, nodes.unit, strict=True)
+    ]
+    return float(np.average(sigmas, weights=nodes.votes))
+
+
+@njit(cache=True, nogil=True)
+def _fits(votes, mean, scatter, unit, t, normal, centre, limit):  # type: ignore[no-untyped-def]
+    """RMS distance of a node's voxels to a plane, or -1 where it does not belong there."""
+    u = unit[t]
+    length = np.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
+    cos = (u[0] * normal[0] + u[1] * normal[1] + u[2] * normal[2]) / length
+    if cos < 2.0 * limit.cos * limit.cos - 1.0:  # twice the angle
+        return -1.0
+    w = 0.0
+    for a in range(3):
+        w += normal[a] * (mean[t, a] - centre[a])
+    s = scatter[t]
+    n = normal
+    spread = (
+        s[0] * n[0] * n[0] + s[3] * n[1] * n[1] + s[5] * n[2] * n[2]
+        + 2.0 * (s[1] * n[0] * n[1] + s[2] * n[0] * n[2] + s[4] * n[1] * n[2])
+    ) / votes[t]  # fmt: skip
+    rms = np.sqrt(max(0.0, spread) + w * w)
+    return rms if rms <= limit.offset else -1.0
+
+
+@njit(cache=True, nogil=True)
+def _adopt_along(votes, mean, scatter, unit, edges, label, normals, centres, limit):  # type: ignore[no-untyped-def]
+    """Offer free nodes to the planes of their neighbours, nearest first, until nothing changes."""
+    count = votes.shape[0]
+    for _ in range(10):
+        best = np.full(count, -1, np.int64)
+        best_rms = np.full(count, np.inf)
+        for e in range(edges.shape[0]):
+            for way in range(2):
+                t, other = edges[e, way], edges[e, 1 - way]
+                p = label[other]
+                if label[t] != -1 or p == -1:
+                    continue
+                rms = _fits(votes, mean, scatter, unit, t, normals[p], centres[p], limit)
+                if rms >= 0.0 and (rms < best_rms[t] or (rms == best_rms[t] and p < best[t])):
+                    best[t], best_rms[t] = p, rms
+        changed = False
+        for t in range(count):
+            if best[t] >= 0:
+                label[t] = best[t]
+                changed = True
+        if not changed:
+            break
+
+
+def _adopt(
+    table: Table, label: NDArray[np.int64], nodes: Nodes, limit: Limits
+) -> NDArray[np.int64]:
+    label = label.copy()
+    normals = np.array(
+        [
+            plane_of(v, s, u)[:3]
+            for v, s, u in zip(nodes.votes, nodes.scatter, nodes.unit, strict=True)
+        ]
+    ).reshape(-1, 3)
+    _adopt_along(*table.nodes, table.edges, label, normals, nodes.mean, limit)
+    return label
+
+
+class PointFit(NamedTuple):
+    """Least-squares planes through the points, K of them. Metres, about the map's origin."""
+
+    num_points: NDArray[np.int64]  # (K,)
+    centroid: NDArray[np.float64]  # (K, 3)
+    scatter: NDArray[np.float64]  # (K, 6)
+
+
+@njit(cache=True, nogil=True)
+def _pool_points(points, corners, label, core, count, num, mean, scatter):  # type: ignore[no-untyped-def]
+    m, s = np.zeros(3), np.zeros(6)
+    own_mean, own = np.zeros(3), np.zeros(6)
+    for t in range(points.shape[0]):
+        p = label[t]
+        if p < 0 or not core[t] or points[t, 0] == 0:
+            continue
+        n = float(points[t, 0])
+        i = 0
+        for a in range(3):
+            own_mean[a] = corners[t, a] + points[t, 1 + a] / n / TICKS
+            for b in range(a, 3):
+                centred = points[t, 4 + i] - points[t, 1 + a] / n * points[t, 1 + b]
+                own[i] = centred / (TICKS * TICKS)
+                i += 1
+        if num[p] == 0:
+            mean[p], scatter[p] = own_mean, own
+        else:
+            pool(float(num[p]), mean[p], scatter[p], n, own_mean, own, m, s)
+            mean[p], scatter[p] = m, s
+        num[p] += points[t, 0]
+
+
+def fit_points(table: Table, planes: PlaneSet, voxel_m: float) -> PointFit:
+    """Pool the exact point moments of each plane's core tile-planes, in canonical order."""
+    count = len(planes.nodes.votes)
+    num = np.zeros(count, np.int64)
+    mean, scatter = np.zeros((count, 3)), np.zeros((count, 6))
+    corners = (unpack_all(table.tile_keys) * float(TILE))[table.tile_of]
+    _pool_points(table.points, corners, planes.label, planes.core, count, num, mean, scatter)
+    return PointFit(num, mean * voxel_m, scatter * voxel_m**2)
