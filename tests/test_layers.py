@@ -48,6 +48,9 @@ LAYERS = {  # the longest name that fits counts
     "facet.sinks": Layer(
         "facet.sinks.* facet.export.* facet_protocol.*", "numpy zenoh mcap rerun rerun_cli"
     ),
+    "facet.sinks.viewer": Layer(  # a process of its own: a client, with a client's session
+        "facet.session facet.sinks.* facet_protocol.*", "zenoh"
+    ),
     "facet.export": Layer(
         "facet.export.* facet_protocol.*", "numpy trimesh plyfile shapely matplotlib PIL"
     ),

@@ -23,10 +23,13 @@ from facet_protocol.messages import (
     PlaneClass,
     Pose,
     Scan,
+    StampedPose,
     Status,
     TilePoints,
 )
+from facet_protocol.topics import pose_topic
 
+POSE_TOPICS = pose_topic("_").removesuffix("_")
 PLANES_EVERY_NS = 250_000_000  # of stamps
 POINTS_EVERY_NS = 1_000_000_000
 PATH_STEP_M = 0.05  # a robot that stands still grows no path
@@ -69,9 +72,12 @@ class Dashboard:
         stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         stream.send_blueprint(drawing.blueprint(None))
 
-    def draw(self, message: Message | None) -> None:
+    def draw(self, message: Message | None, topic: str = "") -> None:
         """One message of the pipeline, whatever it is; what cannot be drawn is passed over."""
         match message:
+            case StampedPose() if topic.startswith(POSE_TOPICS):
+                robot = topic.removeprefix(POSE_TOPICS)
+                self.write_scan_pose(robot, message.pose, message.stamp_ns)
             case Scan():
                 self.write_scan_pose(message.robot, message.pose, message.stamp_ns)
             case MapUpdate():
@@ -226,7 +232,7 @@ class RrdViewer:
         self.write_status = self._dashboard.write_status
 
     def write(self, envelope: Envelope, message: Message | None) -> None:
-        self._dashboard.draw(message)
+        self._dashboard.draw(message, envelope.key)
 
     def close(self) -> None:
         """Draw what waits and finish the file; a second call does nothing."""

@@ -141,7 +141,7 @@ def blueprint(bounds: Bounds | None) -> rrb.Blueprint:
     whole = rrb.Spatial3DView(
         name="With ceilings", origin="/", contents=["+ /map/**", "+ /robots/**"]
     )
-    curves = [
+    curves: list[rrb.View | rrb.Container] = [
         rrb.TimeSeriesView(name="Stage times, ms", origin="/stages"),
         rrb.TimeSeriesView(name="Surfaces by class, m²", origin="/area"),
         rrb.Tabs(
