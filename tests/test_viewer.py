@@ -115,7 +115,7 @@ def test_a_late_joiner_gets_map_and_points_then_follows(port):
 
 def test_a_gap_is_closed_by_asking(port):
     updates = office.growth()
-    with _service(port) as service, _follower(port) as (follower, screen):
+    with _service(port) as service, _follower(port) as (follower, _screen):
         _publish(service, updates[0])
         _wait(lambda: follower._mirror.revision == 1, follower.step)
         for update in updates[1:-1]:
@@ -151,7 +151,7 @@ def test_a_service_that_began_anew_replaces_the_map(port):
 
 
 def test_foreign_bytes_are_passed_over(port):
-    with _service(port) as service, _follower(port) as (follower, screen):
+    with _service(port) as service, _follower(port) as (follower, _screen):
         _publish(service, office.growth()[0])
         encoding = zenoh.Encoding.APPLICATION_PROTOBUF.with_schema("facet.v1.MapUpdate")
         service.session.put(update_key("office"), b"\xff\xff\xff", encoding=encoding)
