@@ -74,7 +74,11 @@ class Match:
         return np.abs(plane.height(self.truth, self.uv)).reshape(self.seen.shape) <= offset_m
 
     def _cover(self, plane: ModelPlane, offset_m: float) -> Mask:
-        near = self.within(plane, offset_m) & self.seen
+        return self.area(plane, offset_m) & self.seen
+
+    def area(self, plane: ModelPlane, offset_m: float) -> Mask:
+        """The cells that the plane's surfaces cover, seen or not."""
+        near = self.within(plane, offset_m)
         covered = np.zeros_like(near)
         if not near.any():
             return covered

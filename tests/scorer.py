@@ -56,6 +56,7 @@ class Score:
     thin_walls_lost: tuple[tuple[str, str], ...]  # of which a face was not found
     openings: tuple[str, ...]
     openings_missed: tuple[str, ...]
+    openings_instead: tuple[str, ...]  # of each one missed: filled, unobserved, outside the outline
     openings_false: int
     openings_false_at: tuple[int, ...] = field(default=())  # ids of their planes
 
@@ -105,7 +106,10 @@ class Score:
             "split": self.splits,
             "merged": tuple(" + ".join(pair) for pair in self.merges),
             "thin wall lost": tuple(" | ".join(pair) for pair in self.thin_walls_lost),
-            "opening missed": self.openings_missed,
+            "opening missed": tuple(
+                f"{name} ({what})"
+                for name, what in zip(self.openings_missed, self.openings_instead, strict=True)
+            ),
             "false opening on plane": tuple(str(i) for i in self.openings_false_at),
         }
         rows += [(name, ", ".join(items)) for name, items in wrongs.items() if items]
@@ -119,7 +123,7 @@ def score(model: Mapping[str, Any], truth: Truth | Mapping[str, Any]) -> Score:
     flat = [s for s in truth.surfaces if s.planar]
     scored = [Match(s, planes) for s in flat if s.seen_m2 >= MIN_SURFACE_M2]
     right, wrong, curved = _areas(planes, truth)
-    missed, openings = _openings(scored)
+    missed, instead, openings = _openings(scored)
     false_at = _false_openings(planes, flat)
     found = {m.truth.name for m in scored if m.result.found}
     thin = _thin_walls(scored)
@@ -139,6 +143,7 @@ def score(model: Mapping[str, Any], truth: Truth | Mapping[str, Any]) -> Score:
         thin_walls_lost=tuple(pair for pair in thin if not found.issuperset(pair)),
         openings=openings,
         openings_missed=missed,
+        openings_instead=instead,
         openings_false=len(false_at),
         openings_false_at=false_at,
     )
@@ -280,18 +285,29 @@ def _thin_walls(matches: list[Match]) -> tuple[tuple[str, str], ...]:
     return tuple(pairs)
 
 
-def _openings(matches: list[Match]) -> tuple[tuple[str, ...], tuple[str, ...]]:
-    """Names of the openings that the model misses, and of all that it should have."""
-    missed, names = [], []
+def _openings(matches: list[Match]) -> tuple[tuple[str, ...], tuple[str, ...], tuple[str, ...]]:
+    """Names of the openings that the model misses, what is there instead, and all names."""
+    missed, instead, names = [], [], []
     for match in matches:
         for number, hole in enumerate(match.truth.holes):
             if not _expected(match, hole):
                 continue
-            name = f"{match.truth.name} {hole.what} {number}"
-            names.append(name)
-            if _best_iou(match, match.raster(hole.ring)) < MIN_IOU:
-                missed.append(name)
-    return tuple(missed), tuple(names)
+            names.append(f"{match.truth.name} {hole.what} {number}")
+            cells = match.raster(hole.ring)
+            if _best_iou(match, cells, HoleKind.OPENING) < MIN_IOU:
+                missed.append(names[-1])
+                instead.append(_instead(match, cells))
+    return tuple(missed), tuple(instead), tuple(names)
+
+
+def _instead(match: Match, cells: Mask) -> str:
+    if _best_iou(match, cells, HoleKind.UNOBSERVED) >= MIN_IOU:
+        return "unobserved"
+    if any(
+        share((match.area(p, MAX_OFFSET_M) & cells).sum(), cells.sum()) > 0.5 for p in match.planes
+    ):
+        return "filled"
+    return "outside the outline" if match.covered.any() else "no surface"
 
 
 def _expected(match: Match, hole: HoleTruth) -> bool:
@@ -303,11 +319,11 @@ def _expected(match: Match, hole: HoleTruth) -> bool:
     return bool(told and large and share((around & match.seen).sum(), around.sum()) >= AROUND_SHARE)
 
 
-def _best_iou(match: Match, cells: Mask) -> float:
+def _best_iou(match: Match, cells: Mask, wanted: HoleKind) -> float:
     best = 0.0
     for plane in match.planes:
         for kind, ring in (hole for _, holes in plane.surfaces for hole in holes):
-            theirs = match.raster(ring) if kind == HoleKind.OPENING else np.zeros_like(cells)
+            theirs = match.raster(ring) if kind == wanted else np.zeros_like(cells)
             common = cells & theirs & match.within(plane, MAX_OFFSET_M)
             best = max(best, share(common.sum(), (cells | theirs).sum()))
     return best

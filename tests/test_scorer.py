@@ -127,6 +127,7 @@ def test_a_filled_hole_is_a_missed_opening_and_wrong_area(office: Truth, model: 
     surface_of(model, office, "N3 N")["holes"].clear()
     result = score(model, office)
     assert result.openings_missed == ("N3 N window 0",)
+    assert result.openings_instead == ("filled",)
     assert 0.6 * 2.4 < result.wrong_m2 < 2.4  # its rim is within the tolerance
 
 
@@ -134,7 +135,23 @@ def test_a_hole_of_the_wrong_kind_is_a_missed_opening(office: Truth, model: Mode
     surface_of(model, office, "N3 N")["holes"][0]["kind"] = "unobserved"
     result = score(model, office)
     assert result.openings_missed == ("N3 N window 0",)
+    assert result.openings_instead == ("unobserved",)
     assert result.wrong_m2 == 0.0
+
+
+def test_a_door_left_out_of_the_outline_is_a_missed_opening(office: Truth, model: Model) -> None:
+    truth, surface = office.surface("N1 S"), surface_of(model, office, "N1 S")
+    (hole,) = surface["holes"]
+    u = np.sort(truth.flat(np.array(hole["ring"]))[:, 0])
+    a, b, *top = truth.flat(np.array(surface["outer"]))
+    notch = [[u[0], 0.0], [u[0], 2.1], [u[-1], 2.1], [u[-1], 0.0]]
+    uv = np.array([a, *notch, b, *top])
+    outer = truth.origin + uv[:, :1] * truth.axis_u + uv[:, 1:] * truth.axis_v
+    surface |= {"outer": outer.tolist(), "holes": []}
+    result = score(model, office)
+    assert result.openings_missed == ("N1 S door 0",)
+    assert result.openings_instead == ("outside the outline",)
+    assert result.area_recall == result.area_precision == 1.0
 
 
 def test_an_opening_that_is_not_there_is_false(office: Truth, model: Model) -> None:
