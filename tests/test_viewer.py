@@ -2,6 +2,8 @@
 
 import contextlib
 import socket
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from types import SimpleNamespace
@@ -17,7 +19,6 @@ from facet.sinks.publisher import Publisher
 from facet.sinks.screen import Screen
 from facet.sinks.snapshots import Snapshots
 from facet.sinks.viewer import Follower
-from facet.sinks.viewer_process import start_viewer, stop_viewer
 from facet_protocol.codec import encode
 from facet_protocol.messages import Envelope, MapUpdate, Status, TilePoints
 from facet_protocol.topics import update_key
@@ -179,7 +180,8 @@ def test_the_web_dashboard_listens_on_loopback_only_and_ends_when_it_hangs(port)
     with _service(port) as service:
         for update in office.growth():
             _publish(service, update)
-        process = start_viewer(f"tcp/127.0.0.1:{port}", "office", "web")
+        command = [sys.executable, "-m", "facet.sinks.viewer", f"tcp/127.0.0.1:{port}"]
+        process = subprocess.Popen([*command, "office", "web", "--tied"])
         viewer = psutil.Process(process.pid)
         try:
             _wait(lambda: any(c.name() == "rerun" for c in viewer.children()))
@@ -191,7 +193,8 @@ def test_the_web_dashboard_listens_on_loopback_only_and_ends_when_it_hangs(port)
             rerun.suspend()
         finally:
             started = time.monotonic()
-            stop_viewer(process)
+            process.terminate()
+            process.wait(5.0)
         assert time.monotonic() - started < 2.0
         _wait(lambda: not rerun.is_running() or rerun.status() == psutil.STATUS_ZOMBIE)
 

@@ -184,7 +184,7 @@ class Dashboard:
         """Step back when the map has outgrown the view; otherwise leave the eye to the user."""
         bounds = drawing.bounds_of(self._planes.values())
         extent = 0.0 if bounds is None else float(np.linalg.norm(bounds[1] - bounds[0]))
-        if extent > 1.5 * self._extent:
+        if extent > 1.3 * self._extent:
             self._extent = extent
             self._stream.send_blueprint(drawing.blueprint(bounds))
 

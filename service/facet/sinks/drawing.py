@@ -174,7 +174,7 @@ def _eye(bounds: Bounds | None) -> rrb.EyeControls3D | None:
     size = bounds[1] - bounds[0]
     middle = bounds.mean(axis=0) - np.array([0.0, 0.0, 0.4 * size[2]])
     direction = np.array([-0.30, -0.72, 0.95])
-    distance = 0.80 * float(np.hypot(size[0], size[1])) + float(size[2])
+    distance = 0.85 * float(np.hypot(size[0], size[1])) + max(float(size[2]), 2.5)
     return rrb.EyeControls3D(
         kind=rrb.Eye3DKind.Orbital,
         position=middle + direction * distance / np.linalg.norm(direction),
