@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 
-from facet.sources.naming import robot_and_sensor
-from facet.sources.recording import is_scan
+from facet.sources.naming import is_scan, robot_and_sensor
 from facet_protocol import topics
 from facet_protocol.codec import decode
 from facet_protocol.messages import Cut, Envelope, ProtocolError

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 import threading
 import time
@@ -14,6 +15,7 @@ from typing import Any
 
 import zenoh
 
+from facet import __version__
 from facet.admission import Admission
 from facet.config import Config
 from facet.export.formats import FORMATS
@@ -227,7 +229,8 @@ def _recorder(config: Config, mapper: Mapper) -> Recorder:
         "map": config.map.id,
         "frame": config.map.frame,
         "config": config.model_dump_json(exclude={"network"}),
-        "settings": ", ".join(f"{k}={v!r}" for k, v in mapper.settings.as_dict().items()),
+        "settings": json.dumps(mapper.settings.as_dict()),
+        "version": __version__,
     }
     return Recorder(
         record.directory,

@@ -87,3 +87,8 @@ def _tls(network: NetworkSection) -> dict[str, Any]:
     if network.root_ca_certificate is not None:
         tls["root_ca_certificate"] = str(network.root_ca_certificate)
     return tls
+
+
+def client_endpoint(network: NetworkSection) -> str:
+    """Where a client on this machine reaches the service."""
+    return network.listen[0] if network.listen else network.connect[0]

@@ -8,8 +8,8 @@ from pathlib import Path
 from mcap.writer import CompressionType, Writer
 
 from facet.sinks.durable_file import DurableFile
-from facet_protocol.codec import descriptor_set
-from facet_protocol.messages import Envelope, ProtocolError
+from facet_protocol.codec import Message, descriptor_set
+from facet_protocol.messages import Envelope, ProtocolError, Scan, TilePoints
 
 COMPRESSIONS = {
     "lz4": CompressionType.LZ4,
@@ -118,3 +118,28 @@ def write_recording(
         raise
     partial.replace(path)
     return num
+
+
+class UpdateLog:
+    """A sink that writes what a replay derives, without the scans: the same log, the same bytes."""
+
+    def __init__(self, path: Path) -> None:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.unlink(missing_ok=True)
+        self._log: LogFile | None = LogFile(DurableFile(path), {"cuts": "logged"})
+        self._synced = 0
+
+    def write(self, envelope: Envelope, message: Message | None) -> None:
+        """Take one message of ours; scans are in the log that is replayed."""
+        if self._log is None or isinstance(message, Scan | TilePoints):
+            return
+        self._log.add(envelope, envelope.received_ns)
+        if self._log.num_bytes - self._synced > SYNC_BYTES:
+            self._log.sync()
+            self._synced = self._log.num_bytes
+
+    def close(self) -> None:
+        """Finish the file; a second call does nothing."""
+        if self._log is not None:
+            self._log.finish()
+            self._log = None

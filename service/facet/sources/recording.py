@@ -6,10 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from facet.sources.mcap_stream import Damage, LogError, LogMessage, McapStream
+from facet.sources.naming import is_scan
 from facet_protocol import topics
 from facet_protocol.messages import Envelope
-
-SCAN_SCHEMAS = frozenset({"foxglove.PointCloud", "foxglove.LaserScan"})
 
 
 class Recording:
@@ -30,6 +29,12 @@ class Recording:
                 stream.metadata.clear()
                 yield envelope_of(message)
             self.metadata.update((m.name, m.metadata) for m in stream.metadata)
+
+    def head(self) -> dict[str, str]:
+        """What the first file says of itself before its first message: settings, map, frame."""
+        stream = McapStream(self.paths[0])
+        next(stream.messages(), None)
+        return next((dict(m.metadata) for m in stream.metadata if m.name == "facet"), {})
 
     @property
     def is_damaged(self) -> bool:
@@ -54,11 +59,6 @@ def envelope_of(message: LogMessage) -> Envelope:
         sequence=message.sequence + (_number(metadata.get("sequence_high")) << 32),
         received_ns=message.log_time_ns,
     )
-
-
-def is_scan(envelope: Envelope) -> bool:
-    """Whether it is an input: our own points (`/facet/points`) are clouds too, but no scans."""
-    return envelope.schema in SCAN_SCHEMAS and not envelope.key.startswith("/facet/")
 
 
 def is_replayed(envelope: Envelope) -> bool:

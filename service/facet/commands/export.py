@@ -1,0 +1,49 @@
+"""`facet export`: a model, or the map of a log, in another program's format."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from facet.commands.terminal import Exit, existing, megabytes, out
+from facet.config import Config
+
+
+def export(
+    file: Annotated[
+        Path, typer.Argument(metavar="MODEL|LOG", help="model.json, or a log (.mcap).")
+    ],
+    out_file: Annotated[Path, typer.Argument(metavar="OUT", help="The file to write.")],
+    file_format: Annotated[
+        str | None, typer.Option("--format", help="json | ply | glb | png; by OUT's ending.")
+    ] = None,
+) -> None:
+    """Write a map in another format.
+
+    \b
+    facet export out/log/model.json rooms.glb      # surfaces, for any 3-D program
+    facet export out/log points.ply                # a log also has its points
+    facet export out/log/model.json plan.png
+    """
+    from facet.export.formats import FORMATS
+    from facet.export.model import read_model
+
+    name = file_format or out_file.suffix.removeprefix(".")
+    if name not in FORMATS:
+        raise typer.BadParameter(f"{name!r} is not one of {', '.join(FORMATS)}")
+    existing([file])
+    code = Exit.CLEAN
+    if file.suffix == ".json":
+        model, tiles = read_model(file), []
+    else:
+        from facet.commands.replay import replay_log, require_scans
+
+        result = replay_log([file], Config())
+        require_scans(result)
+        model, tiles, code = result.model(), result.mapper.points(), result.exit_code
+    out_file.parent.mkdir(parents=True, exist_ok=True)
+    FORMATS[name](model, tiles, out_file)
+    out.print(f"{out_file}: {len(model['planes'])} planes, {megabytes(out_file.stat().st_size)}")
+    raise typer.Exit(code)

@@ -1,0 +1,174 @@
+"""`facet import`: scans in other formats to a recording, each with the pose it was taken from."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+
+from facet.commands.simulate import envelope_of
+from facet.commands.terminal import InputError, existing, megabytes, out, progress
+from facet.sinks.log_file import write_recording
+from facet_protocol.messages import Envelope, Pose, Scan, ScanKind
+
+PERIOD_NS = 100_000_000  # of scans without stamps of their own
+NONE = np.zeros((0, 3), dtype=np.float32)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PosedCloud:
+    """One scan of a file: points in the sensor's frame and T_world_sensor."""
+
+    stamp_ns: int
+    pose: Pose
+    points: NDArray[np.float32]  # (N, 3) m, sensor frame
+
+
+def import_(
+    source: Annotated[
+        Path, typer.Argument(metavar="FILE|DIR", help=".npz, .ply or .pcd, or a folder of clouds.")
+    ],
+    out_file: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The recording.")],
+    poses: Annotated[
+        Path | None, typer.Option(help="Lines `stamp x y z qx qy qz qw` (TUM), one a cloud.")
+    ] = None,
+    robot: Annotated[str, typer.Option(help="Name of the robot.")] = "import",
+    sensor: Annotated[str, typer.Option(help="Name of the sensor.")] = "cloud",
+    map_id: Annotated[str, typer.Option("--map", help="Name of the map.")] = "map",
+) -> None:
+    """Make a recording of scans from elsewhere.
+
+    \b
+    facet import corridor.npz corridor.mcap        # stamp_ns, T_world_sensor, points, lengths
+    facet import clouds/ a.mcap --poses poses.txt  # *.ply or *.pcd in the order of their names
+    facet import scan.ply a.mcap                   # one cloud, taken at the origin of its frame
+    """
+    existing([source] + ([poses] if poses else []))
+    num_scans, clouds = _open(source, poses)
+
+    def envelopes() -> Iterator[Envelope]:
+        with progress("importing", num_scans) as bar:
+            for sequence, cloud in enumerate(clouds, start=1):
+                yield envelope_of(_scan(cloud, robot, sensor, sequence), map_id)
+                bar.update(bar.task_ids[0], completed=sequence)
+
+    metadata = {"map": map_id, "frame": "map", "made_by": f"facet import {source.name}"}
+    num = write_recording(out_file, envelopes(), metadata)
+    out.print(f"{out_file}: {num:,} scans, {megabytes(out_file.stat().st_size)}")
+
+
+def _scan(cloud: PosedCloud, robot: str, sensor: str, sequence: int) -> Scan:
+    return Scan(
+        robot=robot,
+        sensor=sensor,
+        epoch=1,
+        sequence=sequence,
+        stamp_ns=cloud.stamp_ns,
+        frame_id="map",
+        kind=ScanKind.CLOUD,
+        pose=cloud.pose,
+        points=cloud.points,
+        no_return=NONE,
+    )
+
+
+def _open(source: Path, poses: Path | None) -> tuple[int, Iterator[PosedCloud]]:
+    """(how many, the clouds). Raises InputError."""
+    if source.suffix == ".npz":
+        return _read_npz(source)
+    files = [source] if source.is_file() else _clouds_in(source)
+    if poses is None and len(files) > 1:
+        raise InputError(f"{source}: {len(files)} clouds need their poses: --poses FILE")
+    posed = _read_poses(poses) if poses else [(0, Pose(np.zeros(3), np.array([0.0, 0, 0, 1])))]
+    if len(posed) != len(files):
+        raise InputError(f"{poses}: {len(posed)} poses for {len(files)} clouds")
+    return len(files), (
+        PosedCloud(stamp, pose, _read_cloud(f))
+        for f, (stamp, pose) in zip(files, posed, strict=True)
+    )
+
+
+def _clouds_in(folder: Path) -> list[Path]:
+    files = sorted(f for f in folder.iterdir() if f.suffix in (".ply", ".pcd"))
+    if not files:
+        raise InputError(f"{folder}: no .ply or .pcd file in it")
+    return files
+
+
+def _read_npz(path: Path) -> tuple[int, Iterator[PosedCloud]]:
+    """`stamp_ns` (S,), `T_world_sensor` (S, 4, 4), `points` (N, 3), `lengths` (S,)."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            stamps, transforms = data["stamp_ns"], data["T_world_sensor"]
+            points, lengths = data["points"].astype(np.float32, copy=False), data["lengths"]
+    except (OSError, ValueError, KeyError) as error:
+        raise InputError(f"{path}: {error}") from error
+    num = len(stamps)
+    if transforms.shape != (num, 4, 4) or lengths.shape != (num,) or lengths.sum() != len(points):
+        raise InputError(f"{path}: {num} stamps, poses {transforms.shape}, {len(points)} points")
+    ends = np.cumsum(lengths)
+    return num, (
+        PosedCloud(int(stamps[k]), _pose_of(transforms[k]), points[ends[k] - lengths[k] : ends[k]])
+        for k in range(num)
+    )
+
+
+def _pose_of(T_world_sensor: NDArray[np.float64]) -> Pose:
+    """The pose of a rigid (4, 4) transform."""
+    from scipy.spatial.transform import Rotation
+
+    xyzw = Rotation.from_matrix(T_world_sensor[:3, :3]).as_quat()
+    return Pose(T_world_sensor[:3, 3].astype(np.float64), xyzw)
+
+
+def _read_poses(path: Path) -> list[tuple[int, Pose]]:
+    """(stamp in ns, pose) of every line `stamp x y z qx qy qz qw`; # starts a comment."""
+    posed = []
+    for number, line in enumerate(path.read_text("utf-8").splitlines(), start=1):
+        words = line.split("#")[0].split()
+        if not words:
+            continue
+        try:
+            values = np.array([float(word) for word in words[1:]])
+            stamp_ns = _nanoseconds(words[0])
+        except ValueError as error:
+            raise InputError(f"{path}:{number}: {error}") from error
+        if len(values) != 7:
+            raise InputError(f"{path}:{number}: {len(words)} numbers, expected 8")
+        posed.append((stamp_ns, Pose(values[:3], values[3:])))
+    return posed
+
+
+def _nanoseconds(seconds: str) -> int:
+    """Exactly: a float has no room for nanoseconds since 1970."""
+    whole, _, fraction = seconds.partition(".")
+    return int(whole) * 10**9 + int((fraction + "0" * 9)[:9])
+
+
+def _read_cloud(path: Path) -> NDArray[np.float32]:
+    """(N, 3) m of a PLY or PCD file. Raises InputError."""
+    try:
+        if path.suffix == ".pcd":
+            return _read_pcd(path)
+        from plyfile import PlyData
+
+        vertex = PlyData.read(path)["vertex"]
+        return np.stack([np.asarray(vertex[axis], np.float32) for axis in "xyz"], axis=1)
+    except InputError:
+        raise
+    except Exception as error:
+        raise InputError(f"{path}: {error}") from error
+
+
+def _read_pcd(path: Path) -> NDArray[np.float32]:
+    try:
+        from pypcd4.pypcd4 import PointCloud
+    except ImportError:
+        raise InputError(f"{path}: reading PCD needs pypcd4: pip install 'facet[import]'") from None
+    cloud = PointCloud.from_path(path)
+    return np.asarray(cloud.numpy(("x", "y", "z")), dtype=np.float32)

@@ -1,0 +1,186 @@
+"""`facet info` and `facet digest`: what a file holds, what it lost, what its map hashes to."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from facet.commands.terminal import Exit, err, existing, megabytes, out, table
+from facet.config import Config
+from facet.sequences import SequenceLedger
+from facet.sources.naming import is_scan, source_of
+from facet.sources.recording import Recording
+from facet_protocol import topics
+from facet_protocol.codec import decode
+from facet_protocol.messages import Envelope, Loss, ProtocolError
+
+
+@dataclass(slots=True)
+class Channel:
+    """One topic of a recording."""
+
+    schema: str
+    num_messages: int = 0
+    num_bytes: int = 0
+    first_ns: int = 0
+    last_ns: int = 0
+
+
+@dataclass(slots=True)
+class Contents:
+    """What a recording holds, by topic and by source."""
+
+    channels: dict[str, Channel] = field(default_factory=dict)
+    scans: Counter[str] = field(default_factory=Counter)
+    duplicates: Counter[str] = field(default_factory=Counter)
+    losses: Counter[str] = field(default_factory=Counter)  # what the log says of itself
+    cuts: set[int] = field(default_factory=set)
+    ledger: SequenceLedger = field(default_factory=SequenceLedger)
+
+    def note(self, envelope: Envelope) -> None:
+        """Count one message."""
+        channel = self.channels.setdefault(envelope.key, Channel(envelope.schema))
+        channel.num_messages += 1
+        channel.num_bytes += len(envelope.payload)
+        channel.first_ns = channel.first_ns or envelope.received_ns
+        channel.last_ns = max(channel.last_ns, envelope.received_ns)
+        if is_scan(envelope):
+            source = source_of(envelope.key)
+            self.scans[source] += 1
+            if not self.ledger.note(source, envelope.epoch, envelope.sequence)[0]:
+                self.duplicates[source] += 1
+        elif envelope.key in (topics.CUT_TOPIC, topics.LOSS_TOPIC):
+            self._note_own(envelope)
+
+    def _note_own(self, envelope: Envelope) -> None:
+        try:
+            message = decode(envelope)
+        except ProtocolError:
+            return
+        if isinstance(message, Loss):
+            self.losses[message.reason] += message.count
+        else:
+            self.cuts.add(getattr(message, "revision", 0))
+
+
+def info(
+    file: Annotated[Path, typer.Argument(help="A log (.mcap), a folder of them, or model.json.")],
+) -> None:
+    """What is in a log or a model, and what was lost.
+
+    \b
+    facet info out/log
+    facet info out/log/model.json
+
+    Exit code 3: the log is damaged or cut off; what could be read was counted.
+    """
+    existing([file])
+    if file.suffix == ".json":
+        _model_info(file)
+        return
+    recording, contents = Recording([file]), Contents()
+    for envelope in recording:
+        contents.note(envelope)
+    _print_contents(recording, contents)
+    raise typer.Exit(Exit.LOST if recording.is_damaged else Exit.CLEAN)
+
+
+def _print_contents(recording: Recording, contents: Contents) -> None:
+    channels = sorted(contents.channels.items())
+    firsts = [channel.first_ns for _, channel in channels if channel.first_ns]
+    out.print(f"{len(recording.paths)} files, {megabytes(recording.num_bytes)}")
+    if firsts:
+        last_ns = max(channel.last_ns for _, channel in channels)
+        out.print(f"{_utc(min(firsts))} to {_utc(last_ns)}, {(last_ns - min(firsts)) * 1e-9:.1f} s")
+    rows = [
+        (topic, c.schema, c.num_messages, megabytes(c.num_bytes), _rate(c)) for topic, c in channels
+    ]
+    table("channels", ("topic", "schema", "messages", "size", "Hz"), rows)
+    missing, epochs = contents.ledger.missing(), contents.ledger.num_epochs()
+    sources = [
+        (s, n, epochs.get(s, 0), missing.get(s, 0), contents.duplicates[s])
+        for s, n in sorted(contents.scans.items())
+    ]
+    table("sources", ("robot/sensor", "scans", "epochs", "missing", "duplicates"), sources)
+    out.print(f"{len(contents.cuts):,} updates were cut")
+    for reason, num in sorted(contents.losses.items()):
+        out.print(f"{num:,} scans {reason}, as the log says itself")
+    metadata = recording.metadata.get("facet", {})
+    if metadata:
+        table("metadata", ("key", "value"), sorted(metadata.items()))
+    for path, damage in recording.damage.items():
+        for note in damage.notes:
+            err.print(f"damage: {path}: {note}")
+
+
+def _rate(channel: Channel) -> str:
+    span_s = (channel.last_ns - channel.first_ns) * 1e-9
+    return f"{(channel.num_messages - 1) / span_s:.1f}" if span_s > 0 else ""
+
+
+def _utc(stamp_ns: int) -> str:
+    return datetime.fromtimestamp(stamp_ns * 1e-9, tz=UTC).strftime("%Y-%m-%d %H:%M:%S")
+
+
+def _model_info(path: Path) -> None:
+    from facet.commands.replay import summary
+    from facet.export.model import read_model
+
+    model = read_model(path)
+    rows = summary(model, 0.0, 0.0)[:-2]  # without the times, which a model does not have
+    table(str(path), ("what", "value"), rows)
+    planes = [
+        (
+            plane["id"],
+            plane["class"],
+            f"{plane['normal'][0]:+.3f} {plane['normal'][1]:+.3f} {plane['normal'][2]:+.3f}",
+            f"{plane['d']:.3f}",
+            f"{sum(s['area_m2'] for s in plane['surfaces']):.2f}",
+            f"{1e3 * plane['sigma_n_m']:.1f}",
+        )
+        for plane in model["planes"]
+    ]
+    table("planes", ("id", "class", "normal", "d m", "area m²", "sigma mm"), planes)
+
+
+def digest(
+    file: Annotated[Path, typer.Argument(help="A log (.mcap), a folder of them, or model.json.")],
+) -> None:
+    """The two hashes of a map: of its state, and of what is derived from it.
+
+    \b
+    facet digest out/log                # replays it
+    facet digest out/log/model.json     # computes the derived hash again from the file
+
+    Equal scans give equal digests, in whatever order they came. Exit code 65: a model that does
+    not hash to what it says.
+    """
+    existing([file])
+    if file.suffix == ".json":
+        raise typer.Exit(_model_digest(file))
+    from facet.commands.replay import replay_log, require_scans
+
+    result = replay_log([file], Config(), update_every="end")
+    require_scans(result)
+    hashes = result.mapper.digest()
+    out.print(f"state   {hashes.state}")
+    out.print(f"derived {hashes.derived}")
+    raise typer.Exit(result.exit_code)
+
+
+def _model_digest(path: Path) -> Exit:
+    from facet.export.model import read_model
+    from facet.mapping.digest import derived_digest
+
+    model = read_model(path)
+    derived = derived_digest(model["planes"], model["counts"])
+    out.print(f"derived {derived}")
+    if derived != model["digest"]["derived"]:
+        err.print(f"{path} says {model['digest']['derived']}: it was changed, or made elsewhere")
+        return Exit.BAD_INPUT
+    return Exit.CLEAN

@@ -1,0 +1,151 @@
+"""`facet play`: a recording over Zenoh, as the robot that made it would publish it."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated
+
+import typer
+import zenoh
+import zenoh.ext
+
+from facet.commands.terminal import err, existing, out, progress
+from facet.session import DEFAULT_ENDPOINT, client_settings, open_session
+from facet.sources.naming import is_scan, robot_and_sensor
+from facet.sources.recording import Recording
+from facet_protocol import attachment
+from facet_protocol.messages import Envelope
+from facet_protocol.topics import check_id, scan_key
+
+CACHE_BYTES = 64 << 20  # kept for a service that stalled: at 40 Hz of line scans, minutes
+HEARTBEAT_S = 0.2
+LISTENER_S = 5.0
+
+
+class RobotPublisher:
+    """Publishes scans with a sequence number of their own and keeps the last ones to send again."""
+
+    def __init__(self, session: zenoh.Session, map_id: str) -> None:
+        self._session, self._map_id = session, map_id
+        self._epoch = time.time_ns() // 1_000_000 & 0xFFFFFFFF  # a new one at each start
+        self._publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
+        self._sequences: dict[str, int] = {}
+
+    def publish(self, robot: str, sensor: str, envelope: Envelope) -> None:
+        """Send one scan as it is; the first on a key waits for someone to listen."""
+        key = scan_key(self._map_id, robot, sensor)
+        if key not in self._publishers:
+            self._publishers[key] = self._declare(key, envelope)
+        self._sequences[key] = sequence = self._sequences.get(key, 0) + 1
+        self._publishers[key].put(
+            bytes(envelope.payload),
+            encoding=f"application/{envelope.encoding};{envelope.schema}",
+            attachment=attachment.pack(self._epoch, sequence, envelope.stamp_ns),
+        )
+
+    def close(self) -> None:
+        """Stay as long as a heartbeat takes: what is missing at the end can still be asked for."""
+        time.sleep(2 * HEARTBEAT_S)
+        for publisher in self._publishers.values():
+            publisher.undeclare()  # type: ignore[no-untyped-call]
+
+    def _declare(self, key: str, first: Envelope) -> zenoh.ext.AdvancedPublisher:
+        num_kept = max(16, min(4096, CACHE_BYTES // max(1, len(first.payload))))
+        publisher = zenoh.ext.declare_advanced_publisher(
+            self._session,
+            key,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            cache=zenoh.ext.CacheConfig(max_samples=num_kept),
+            sample_miss_detection=zenoh.ext.MissDetectionConfig(
+                heartbeat=None, sporadic_heartbeat=HEARTBEAT_S
+            ),
+            publisher_detection=True,
+        )
+        if not _has_listener(self._session, key):
+            err.print(f"nobody listens to {key}")
+        return publisher
+
+
+def _has_listener(session: zenoh.Session, key: str) -> bool:
+    """Wait for a subscriber: what is sent before it is known would be lost."""
+    probe = session.declare_publisher(key)
+    deadline = time.monotonic() + LISTENER_S
+    try:
+        while not probe.matching_status.matching:  # type: ignore[attr-defined]  # a wrong stub
+            if time.monotonic() > deadline:
+                return False
+            time.sleep(0.01)
+        return True
+    finally:
+        probe.undeclare()  # type: ignore[no-untyped-call]
+
+
+def play_scans(
+    scans: Iterator[Envelope], publisher: RobotPublisher, robot: str | None, speed: float
+) -> Iterator[int]:
+    """Publish each scan at its stamp, `speed` times as fast (0: at once); counts them."""
+    first_ns: int | None = None
+    started = time.monotonic()
+    for num, envelope in enumerate(scans, start=1):
+        stamp_ns = envelope.stamp_ns or envelope.received_ns
+        first_ns = stamp_ns if first_ns is None else first_ns
+        if speed:
+            wait_s = (stamp_ns - first_ns) * 1e-9 / speed - (time.monotonic() - started)
+            time.sleep(max(0.0, wait_s))
+        source_robot, sensor = robot_and_sensor(envelope.key)
+        publisher.publish(robot or source_robot, sensor, envelope)
+        yield num
+
+
+def play(
+    logs: Annotated[list[Path], typer.Argument(help="Recordings (.mcap), or folders of them.")],
+    speed: Annotated[
+        str, typer.Option(help="1: as recorded; N: N times as fast; max: at once.")
+    ] = "1",
+    robot: Annotated[str | None, typer.Option(help="Publish under this robot's name.")] = None,
+    map_id: Annotated[str, typer.Option("--map", help="The map to add to.")] = "map",
+    connect: Annotated[str, typer.Option(help="The service's endpoint.")] = DEFAULT_ENDPOINT,
+    shared_memory: Annotated[bool, typer.Option(help="Large scans by shared memory.")] = True,
+) -> None:
+    """Publish a recording over Zenoh, as the robot would.
+
+    \b
+    facet run &                                    # somebody has to listen
+    facet play recordings/office.mcap              # as it was recorded
+    facet play a.mcap --robot second --speed 10    # another robot, ten times as fast
+    """
+    rate = parse_speed(speed)
+    if robot is not None:
+        check_id(robot)
+    recording = Recording(existing(logs))
+    settings = client_settings(connect, shared_memory)
+    with open_session(settings) as session, progress("playing", _count(logs)) as bar:
+        publisher = RobotPublisher(session, map_id)
+        num = 0
+        try:
+            for num in play_scans(filter(is_scan, recording), publisher, robot, rate):
+                bar.update(bar.task_ids[0], completed=num)
+        finally:
+            publisher.close()
+    out.print(f"played {num:,} scans")
+
+
+def parse_speed(text: str) -> float:
+    """0 for max. Raises typer.BadParameter."""
+    if text == "max":
+        return 0.0
+    try:
+        speed = float(text)
+    except ValueError:
+        speed = -1.0
+    if not 0.0 < speed < float("inf"):
+        raise typer.BadParameter(
+            f"{text!r} is neither a number above 0 nor max", param_hint="speed"
+        )
+    return speed
+
+
+def _count(logs: list[Path], match: Callable[[Envelope], bool] = is_scan) -> int:
+    return sum(map(match, Recording(logs)))

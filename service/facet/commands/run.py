@@ -1,0 +1,171 @@
+"""`facet run`: the service, from the first connection to the last byte of the log."""
+
+from __future__ import annotations
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from facet.commands.settings import (
+    DetailOption,
+    ThetaOption,
+    VoxelOption,
+    make_mapper,
+    mapping_overrides,
+)
+from facet.commands.terminal import Exit, out, set_up_logging, table
+from facet.config import Config, load_config
+from facet.session import client_endpoint, open_session, service_settings
+
+if TYPE_CHECKING:
+    from facet.export.model import Model
+    from facet.service import Service
+
+logger = logging.getLogger(__name__)
+
+WATCH_S = 0.5
+VIEWER_EXIT_S = 1.5
+
+
+def run(
+    config: Annotated[Path | None, typer.Option(help="Settings (TOML).")] = None,
+    map_id: Annotated[str | None, typer.Option("--map", help="Name of the map.")] = None,
+    listen: Annotated[
+        list[str] | None, typer.Option(help="Endpoint to listen on; again for more.")
+    ] = None,
+    connect: Annotated[list[str] | None, typer.Option(help="Router to connect to.")] = None,
+    record: Annotated[Path | None, typer.Option(help="Folder of the log.")] = None,
+    viewer: Annotated[
+        str | None, typer.Option(help="off | web | native | connect:URL of a Rerun viewer.")
+    ] = None,
+    on_full: Annotated[
+        str | None, typer.Option(help="When the disk fails: retry | exit (with 74).")
+    ] = None,
+    voxel: VoxelOption = None,
+    theta: ThetaOption = None,
+    detail_level: DetailOption = None,
+) -> None:
+    """Map what robots send, until SIGTERM or Ctrl-C.
+
+    \b
+    facet run                                      # on tcp/127.0.0.1:7447, log in out/log
+    facet run --viewer web                         # and a dashboard in the browser
+    facet run --config facet.toml --map hall --record /data/hall
+
+    Scans come in on facet/v1/<map>/robot/<robot>/scan/<sensor>. What is not in the log is not in
+    the map. At the end the log is finished and model.json lies beside it. Exit code 3: scans were
+    lost, the table says how many.
+    """
+    set_up_logging()
+    overrides = {
+        "map.id": map_id,
+        "network.listen": listen or None,
+        "network.connect": connect or None,
+        "record.directory": record,
+        "record.on_full": on_full,
+        "viewer": viewer,
+        **mapping_overrides(voxel, theta, detail_level),
+    }
+    raise typer.Exit(serve(load_config(config, overrides)))
+
+
+def serve(config: Config) -> Exit:
+    """Run the service until a signal; the exit code."""
+    from facet.export.model import write_model
+    from facet.service import Service
+    from facet.sinks.recorder import single_writer
+    from facet.warmup import warm_up
+
+    mapper = make_mapper(config)
+    with single_writer(config.record.directory), stop_signals() as stop:
+        warm_up(mapper.settings)
+        with open_session(service_settings(config.network)) as session:
+            service = Service(session, config, mapper)
+            service.start()
+            logger.info("ready: map %s on %s", config.map.id, ", ".join(config.network.listen))
+            try:
+                _watch(service, config, stop)
+            finally:
+                model = service.stop()
+                if model is not None:
+                    write_model(model, config.record.directory / "model.json")
+        return _conclude(service, model)
+
+
+@contextmanager
+def stop_signals() -> Iterator[threading.Event]:
+    """Set by the first SIGTERM or SIGINT; a second one ends the process at once."""
+    stop = threading.Event()
+
+    def on_signal(number: int, frame: FrameType | None) -> None:
+        if stop.is_set():
+            os._exit(128 + number)
+        stop.set()
+
+    previous = {n: signal.signal(n, on_signal) for n in (signal.SIGTERM, signal.SIGINT)}
+    try:
+        yield stop
+    finally:
+        for number, handler in previous.items():
+            signal.signal(number, handler)
+
+
+def _watch(service: Service, config: Config, stop: threading.Event) -> None:
+    """Wait for the end; the viewer may come and go."""
+    viewer = _start_viewer(config)
+    try:
+        while not stop.wait(WATCH_S) and not service.ended.is_set():
+            if viewer is not None and viewer.poll() is not None:
+                logger.warning("the viewer ended with code %d; the map goes on", viewer.returncode)
+                service.account.count("viewer_ended")
+                viewer = None
+    finally:
+        if viewer is not None:
+            _end(viewer)
+
+
+def _start_viewer(config: Config) -> subprocess.Popen[bytes] | None:
+    if config.viewer == "off":
+        return None
+    endpoint = client_endpoint(config.network)
+    command = [sys.executable, "-m", "facet.sinks.viewer", endpoint, config.map.id, config.viewer]
+    return subprocess.Popen([*command, "--tied"], start_new_session=True)
+
+
+def _end(child: subprocess.Popen[bytes]) -> None:
+    child.terminate()
+    with suppress(subprocess.TimeoutExpired):
+        child.wait(VIEWER_EXIT_S)
+        return
+    child.kill()
+    child.wait()
+
+
+def _conclude(service: Service, model: Model | None) -> Exit:
+    """The last word: what was recorded, what was lost."""
+    account = service.account
+    received, recorded = account["received"], account["recorded"]
+    lost = received - recorded + account["lost_upstream"]
+    share = 100.0 * recorded / received if received else 100.0
+    table("counters", ("counter", "value"), account.counters().items())
+    out.print(
+        f"recorded {recorded:,} of {received:,} received ({share:.1f} %), "
+        f"lost upstream {account['lost_upstream']:,}"
+    )
+    for path in service.recorder.paths:
+        out.print(f"log    {path}")
+    if service.fault is not None:
+        return Exit.FAULT
+    if account.failure:
+        return Exit.IO
+    return Exit.LOST if lost or model is None else Exit.CLEAN

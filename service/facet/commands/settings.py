@@ -1,0 +1,55 @@
+"""Options that several commands share, and the mapper they ask for."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from facet.config import Config, ConfigError
+
+if TYPE_CHECKING:
+    from facet.mapping.mapper import Mapper
+
+VoxelOption = Annotated[float | None, typer.Option("--voxel", help="Voxel edge in metres.")]
+ThetaOption = Annotated[
+    float | None, typer.Option("--theta", help="Largest thickness angle of a normal, in degrees.")
+]
+DetailOption = Annotated[
+    float | None, typer.Option("--detail-level", help="Share of the voxels that planes must hold.")
+]
+FrameOption = Annotated[str | None, typer.Option(help="Frame that poses are given in.")]
+
+
+def make_mapper(config: Config, recorded: Mapping[str, Any] | None = None) -> Mapper:
+    """A mapper with the settings of a log it repeats, and over them those that were given."""
+    from facet.mapping.mapper import Mapper
+    from facet.mapping.settings import MapSettings
+
+    try:
+        settings = MapSettings(**{**(recorded or {}), **config.mapping.given()})
+    except (TypeError, ValueError) as error:
+        raise ConfigError(str(error)) from error
+    return Mapper(settings, config.map.id)
+
+
+def recorded_settings(head: Mapping[str, str]) -> dict[str, Any]:
+    """The mapper's settings that a log was made with; none for a log that does not say."""
+    try:
+        settings = json.loads(head.get("settings", "{}"))
+    except ValueError:
+        return {}
+    return settings if isinstance(settings, dict) else {}
+
+
+def mapping_overrides(
+    voxel: float | None, theta: float | None, detail_level: float | None
+) -> dict[str, Any]:
+    """The three as keys of the configuration."""
+    return {
+        "mapping.voxel_m": voxel,
+        "mapping.theta_deg": theta,
+        "mapping.detail_level": detail_level,
+    }

@@ -1,0 +1,119 @@
+"""`facet status`, `top` and `cmd`: what a running service says, and what it can be told."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterator
+from typing import Annotated
+
+import typer
+import zenoh
+from rich.live import Live
+from rich.table import Table
+
+from facet.commands.terminal import Exit, InputError, err, out
+from facet.session import DEFAULT_ENDPOINT, client_settings, open_session
+from facet_protocol import topics
+from facet_protocol.messages import ProtocolError, Status
+from facet_protocol.records import decode_status
+
+WAIT_S = 3.0  # the service speaks once a second
+MapOption = Annotated[str, typer.Option("--map", help="Name of the map.")]
+ConnectOption = Annotated[str, typer.Option(help="The service's endpoint.")]
+
+
+def statuses(session: zenoh.Session, map_id: str) -> Iterator[Status | None]:
+    """What the service says of itself, as it says it; None when it is silent for WAIT_S."""
+    handler: zenoh.handlers.RingChannel[zenoh.Sample] = zenoh.handlers.RingChannel(4)
+    with session.declare_subscriber(topics.status_key(map_id), handler) as subscriber:
+        while True:
+            yield _next(subscriber)
+
+
+def _next(subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]) -> Status | None:
+    deadline = time.monotonic() + WAIT_S
+    while time.monotonic() < deadline:
+        sample = subscriber.try_recv()
+        if sample is not None:
+            return decode_status(sample.payload.to_bytes())
+        time.sleep(0.02)
+    return None
+
+
+def status(map_id: MapOption = "map", connect: ConnectOption = DEFAULT_ENDPOINT) -> None:
+    """How a running service is.
+
+    \b
+    facet status
+    facet status --map hall --connect tcp/127.0.0.1:7448
+
+    Exit code 3: it lives, but its health is not OK; 74: nobody answers.
+    """
+    with open_session(client_settings(connect)) as session:
+        current = next(statuses(session, map_id))
+        if current is None:
+            raise InputError(f"no service maps {map_id!r} at {connect}")
+        out.print(_table(current))
+    raise typer.Exit(Exit.CLEAN if current.health == "OK" else Exit.LOST)
+
+
+def top(map_id: MapOption = "map", connect: ConnectOption = DEFAULT_ENDPOINT) -> None:
+    """The same, every second, until Ctrl-C."""
+    with (
+        open_session(client_settings(connect)) as session,
+        Live(console=out, screen=out.is_terminal, auto_refresh=False) as live,
+    ):
+        for current in statuses(session, map_id):
+            if current is None:
+                err.print(f"no word from {map_id!r} at {connect}")
+            else:
+                live.update(_table(current), refresh=True)
+
+
+def cmd(
+    name: Annotated[str, typer.Argument(help=" | ".join(topics.COMMANDS))],
+    parameters: Annotated[list[str] | None, typer.Argument(help="key=value")] = None,
+    map_id: MapOption = "map",
+    connect: ConnectOption = DEFAULT_ENDPOINT,
+) -> None:
+    """Tell a running service what to do.
+
+    \b
+    facet cmd pause
+    facet cmd export format=glb
+    facet cmd record                 # start a new log file; the others can be copied
+    """
+    try:
+        selector = topics.cmd_key(map_id, name)
+    except ProtocolError as error:
+        raise typer.BadParameter(str(error)) from error
+    if parameters:
+        selector += "?" + ";".join(parameters)
+    with open_session(client_settings(connect)) as session:
+        replies = list(session.get(selector, timeout=15.0))
+    if not replies:
+        raise InputError(f"no service maps {map_id!r} at {connect}")
+    for reply in replies:
+        if reply.ok is None:
+            assert reply.err is not None
+            err.print(reply.err.payload.to_string())
+            raise typer.Exit(Exit.FAULT)
+        for key, value in json.loads(reply.ok.payload.to_string()).items():
+            out.print(f"{key}: {value}")
+
+
+def _table(current: Status) -> Table:
+    grid = Table(title=f"map {current.map_id}, revision {current.revision}: {current.health}")
+    for column in ("counter", "value", "gauge", "value", "stage", "ms"):
+        grid.add_column(column, justify="right" if column in ("value", "ms") else "left")
+    columns = [
+        [(name, f"{num:,}") for name, num in current.counters.items()],
+        [(name, f"{value:,.3g}") for name, value in current.gauges.items()],
+        [(name, f"{value:.1f}") for name, value in current.stage_ms.items()],
+    ]
+    for k in range(max(map(len, columns))):
+        grid.add_row(
+            *(cell for rows in columns for cell in (rows[k] if k < len(rows) else ("", "")))
+        )
+    return grid

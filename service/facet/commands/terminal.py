@@ -1,0 +1,86 @@
+"""How commands speak: tables on standard output, progress on a terminal only, exit codes."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from enum import IntEnum
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Table
+
+out = Console(highlight=False, soft_wrap=True)
+err = Console(stderr=True, highlight=False, soft_wrap=True)
+
+
+class Exit(IntEnum):
+    CLEAN = 0
+    FAULT = 1  # ours
+    USAGE = 2
+    LOST = 3  # finished, but data was lost or left out
+    BAD_INPUT = 65
+    IO = 74
+    CONFIG = 78
+
+
+class InputError(Exception):
+    """Something given that cannot be read; the text says what."""
+
+
+def set_up_logging() -> None:
+    """One line a message on standard error."""
+    logging.basicConfig(
+        level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", force=True
+    )
+
+
+def table(title: str, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:
+    """Print a table; numbers to the right."""
+    grid = Table(title=title, title_justify="left", title_style="bold", header_style="bold")
+    body = [[_cell(value) for value in row] for row in rows]
+    for k, name in enumerate(columns):
+        numeric = bool(body) and all(_is_number(row[k]) for row in body)
+        grid.add_column(name, justify="right" if numeric else "left", overflow="fold")
+    for row in body:
+        grid.add_row(*row)
+    out.print(grid)
+
+
+def _cell(value: object) -> str:
+    if isinstance(value, float):
+        return f"{value:,.3g}" if abs(value) < 100 else f"{value:,.0f}"
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def _is_number(text: str) -> bool:
+    return text[:1].isdigit() or text[:1] == "-"
+
+
+@contextmanager
+def progress(what: str, total: float | None = None) -> Iterator[Progress]:
+    """A progress bar with one task, 0; nothing in a pipe."""
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=err, disable=not err.is_terminal, transient=True) as bar:
+        bar.add_task(what, total=total)
+        yield bar
+
+
+def existing(paths: Iterable[Path]) -> list[Path]:
+    """The same paths. Raises InputError for one that is not there."""
+    checked = list(paths)
+    for path in checked:
+        if not path.exists():
+            raise InputError(f"{path}: no such file or folder")
+    return checked
+
+
+def megabytes(num_bytes: int) -> str:
+    return f"{num_bytes / 1e6:,.1f} MB" if num_bytes >= 1e5 else f"{num_bytes / 1e3:,.1f} kB"
