@@ -194,13 +194,16 @@ class Intake:
         if self._account.failure:
             logger.warning("the log is being written again")
             self._account.failure = ""
-        self._account.gauge("commit_ms", (time.monotonic() - started) * 1e3)
+        if self._scans:
+            self._account.gauge("commit_ms", (time.monotonic() - started) * 1e3)
         self._hand_on()
 
     def _hand_on(self) -> None:
         scans, self._scans = self._scans, []
         for envelope in scans:
-            self._account.count("recorded", source_of(envelope.key))
+            source = source_of(envelope.key)
+            self._account.count("recorded", source)
+            self._account.gauge("ack", envelope.sequence, source)
         if scans:
             self._durable.put(scans)
 

@@ -78,15 +78,17 @@ class Service:
 
     def start(self) -> None:
         """Publish first, then map, then let scans in."""
-        snapshots = Snapshots(self._config.map.id)
+        self._snapshots = Snapshots(self._config.map.id)
         self._publisher = Publisher(
             self._session,
             self._config.map.id,
-            snapshots,
+            self._snapshots,
             self._config.publish.queue,
             self.account.count,
         )
-        self._answers = Answers(self._session, self._config.map.id, snapshots, self._commands())
+        self._answers = Answers(
+            self._session, self._config.map.id, self._snapshots, self._commands()
+        )
         every_ns = int(self._config.publish.points_s * 1e9) if self._config.publish.points else 0
         self._pipeline = Pipeline(
             self._mapper,
@@ -164,6 +166,8 @@ class Service:
             self.account.gauge("queue_msgs", len(self._inbox) + len(self._durable))
             self.account.gauge("queue_bytes", self._inbox.num_bytes)
             self.account.gauge("recorded_bytes", self.recorder.committed_bytes)
+            self.account.gauge("planes", self._snapshots.num_planes)
+            self.account.gauge("disk_free_mb", self.recorder.free_bytes() / 1e6)
             revision = self._pipeline.revision
             status = self.account.status(self._config.map.id, revision, time.time_ns())
             for sink in (self._publisher, self._intake):

@@ -43,9 +43,10 @@ class Account:
         with self._lock:
             self._counters[name] = value
 
-    def gauge(self, name: str, value: float) -> None:
+    def gauge(self, name: str, value: float, source: str = "") -> None:
+        """Set a gauge; one of a source is kept under the source's name."""
         with self._lock:
-            self._gauges[name] = value
+            self._gauges[f"{name}[{self._known(source)}]" if source else name] = value
 
     def stages(self, stage_ms: Mapping[str, float]) -> None:
         with self._lock:

@@ -11,6 +11,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
+from rich.text import Text
 
 out = Console(highlight=False, soft_wrap=True)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -45,7 +46,7 @@ def table(title: str, columns: Iterable[str], rows: Iterable[Iterable[object]]) 
         numeric = bool(body) and all(_is_number(row[k]) for row in body)
         grid.add_column(name, justify="right" if numeric else "left", overflow="fold")
     for row in body:
-        grid.add_row(*row)
+        grid.add_row(*map(Text, row))  # no markup: names come from outside
     out.print(grid)
 
 

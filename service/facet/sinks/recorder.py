@@ -124,12 +124,18 @@ class Recorder:
         if log.num_bytes >= self._max_file_bytes or age_ns >= self._max_file_ns:
             self.roll()
 
-    def _check_free(self) -> None:
-        if self._min_free_bytes:
+    def free_bytes(self) -> int:
+        """What the disk still has room for; 0 when it does not say."""
+        try:
             disk = os.statvfs(self._directory)
-            if disk.f_bavail * disk.f_frsize < self._min_free_bytes:
-                text = f"less than {self._min_free_bytes >> 20} MiB free"
-                raise OSError(errno.ENOSPC, text, str(self._directory))
+        except OSError:
+            return 0
+        return disk.f_bavail * disk.f_frsize
+
+    def _check_free(self) -> None:
+        if self._min_free_bytes and self.free_bytes() < self._min_free_bytes:
+            text = f"less than {self._min_free_bytes >> 20} MiB free"
+            raise OSError(errno.ENOSPC, text, str(self._directory))
 
 
 @contextmanager

@@ -22,6 +22,10 @@ class Snapshots:
         self._stamp_ns = 0
         self._tiles: dict[tuple[int, int, int], TilePoints] = {}
 
+    @property
+    def num_planes(self) -> int:
+        return len(self._planes)
+
     def apply_tile(self, tile: TilePoints) -> None:
         """The newest points of one tile; an empty one is forgotten."""
         with self._lock:
