@@ -1,0 +1,93 @@
+"""Settings: every default runs, and what is wrong is named."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from facet.config import ConfigError, is_loopback, load_config
+
+
+def load(tmp_path: Path, text: str) -> object:
+    path = tmp_path / "facet.toml"
+    path.write_text(text)
+    return load_config(path)
+
+
+def test_it_runs_without_a_file() -> None:
+    config = load_config()
+    assert config.network.listen == ("tcp/127.0.0.1:7447",)
+    assert config.mapping.given() == {}
+
+
+def test_options_come_over_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "facet.toml"
+    path.write_text('[map]\nid = "hall"\n[mapping]\nvoxel_m = 0.1\n')
+    config = load_config(path, {"mapping.voxel_m": 0.2, "map.id": None})
+    assert (config.map.id, config.mapping.given()) == ("hall", {"voxel_m": 0.2})
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("[mapping]\nvoxel = 0.1", r"unknown key mapping\.voxel; did you mean mapping\.voxel_m\?"),
+        ("[maping]\nvoxel_m = 0.1", r"unknown key maping; did you mean mapping\?"),
+        ("[mapping]\nvoxel_m = 7", r"mapping\.voxel_m = 7: .*>= 0\.005 and <= 1\.0"),
+        ('[map]\nid = "a/b"', r"map\.id = 'a/b'"),
+        ('viewer = "wbe"', "viewer: must be off, web, native"),
+        ('[record]\ncompression = "gz"', "record.compression = 'gz'"),
+        ("x = [", "facet.toml"),
+    ],
+)
+def test_what_is_wrong_is_named(tmp_path: Path, text: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        load(tmp_path, text)
+
+
+def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"nowhere\.toml"):
+        load_config(tmp_path / "nowhere.toml")
+
+
+@pytest.mark.parametrize(
+    ("endpoint", "expected"),
+    [
+        ("tcp/127.0.0.1:7447", True),
+        ("tcp/127.1.2.3:1", True),
+        ("tcp/localhost:7447", True),
+        ("tcp/[::1]:7447", True),
+        ("unixsock-stream//tmp/facet", True),
+        ("tcp/0.0.0.0:7447", False),
+        ("tcp/[::]:7447", False),
+        ("tcp/192.168.1.4:7447", False),
+        ("tls/robots.example:7447", False),
+    ],
+)
+def test_loopback(endpoint: str, expected: bool) -> None:
+    assert is_loopback(endpoint) is expected
+
+
+OPEN = 'listen = ["tls/0.0.0.0:7447"]\n'
+KEYS = 'listen_certificate = "c.pem"\nlisten_private_key = "k.pem"\n'
+
+
+@pytest.mark.parametrize(
+    ("network", "accepted"),
+    [
+        ('listen = ["tcp/0.0.0.0:7447"]\nusers_file = "u"', False),
+        (OPEN, False),
+        (OPEN + KEYS, False),
+        (OPEN + KEYS + "mutual_tls = true", True),
+        (OPEN + KEYS + 'users_file = "u"', True),
+    ],
+)
+def test_the_network_is_let_in_by_key_and_name_only(
+    tmp_path: Path, network: str, accepted: bool
+) -> None:
+    text = f"[network]\n{network}"
+    if accepted:
+        load(tmp_path, text)
+    else:
+        with pytest.raises(ConfigError, match="open to the network"):
+            load(tmp_path, text)
