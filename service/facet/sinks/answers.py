@@ -12,7 +12,7 @@ from typing import Any
 
 import zenoh
 
-from facet.sinks.publisher import encoding_of
+from facet.sinks.publisher import encoding_of, tile_payload
 from facet.sinks.snapshots import Snapshots
 from facet_protocol import topics
 from facet_protocol.codec import encode, facet_descriptors
@@ -90,9 +90,9 @@ class Answers:
         query.reply(topics.snapshot_key(self._map_id), payload, encoding=encoding_of(schema))
 
     def _points(self, query: Any) -> None:
-        for tile in self._snapshots.tiles():
-            schema, payload = encode(tile)
-            query.reply(topics.points_key(self._map_id), payload, encoding=encoding_of(schema))
+        for envelope, tile in self._snapshots.tiles():
+            payload, encoding = tile_payload(envelope, tile), encoding_of(envelope.schema)
+            query.reply(topics.points_key(self._map_id), payload, encoding=encoding)
 
     def _schema(self, query: Any) -> None:
         encoding = encoding_of("google.protobuf.FileDescriptorSet")

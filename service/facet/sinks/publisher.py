@@ -6,6 +6,7 @@ import logging
 import threading
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 
 import zenoh
 import zenoh.ext
@@ -40,7 +41,7 @@ class Publisher:
         self._changed = threading.Condition()
         self._updates: deque[tuple[Envelope, MapUpdate | Events]] = deque()
         self._max_updates = max_updates
-        self._tiles: dict[tuple[int, int, int], TilePoints] = {}  # the newest of each
+        self._tiles: dict[tuple[int, int, int], tuple[Envelope, TilePoints]] = {}  # the newest
         self._status: bytes | None = None
         self._closed = False
         self._planes: dict[int, zenoh.ext.AdvancedPublisher] = {}
@@ -53,8 +54,7 @@ class Publisher:
         if isinstance(message, MapUpdate):
             self._snapshots.apply(message)
         elif isinstance(message, TilePoints):
-            message = thinned(message)
-            self._snapshots.apply_tile(message)
+            self._snapshots.apply_tile(envelope, message)
         with self._changed:
             if isinstance(message, MapUpdate | Events):
                 self._updates.append((envelope, message))
@@ -62,7 +62,7 @@ class Publisher:
                     self._updates.popleft()
                     self._count("publisher_dropped")
             elif isinstance(message, TilePoints):
-                self._tiles[message.tile] = message
+                self._tiles[message.tile] = (envelope, message)
             elif isinstance(message, Status):
                 self._status = bytes(envelope.payload)
             else:
@@ -99,7 +99,7 @@ class Publisher:
         self,
         update: tuple[Envelope, MapUpdate | Events] | None,
         status: bytes | None,
-        tile: TilePoints | None,
+        tile: tuple[Envelope, TilePoints] | None,
     ) -> None:
         if status is not None:
             self._put(topics.status_key(self._map_id), "facet.v1.Status", status)
@@ -113,8 +113,8 @@ class Publisher:
             if isinstance(message, MapUpdate):
                 self._put_planes(message)
         if tile is not None:
-            schema, payload = encode(tile)
-            self._put(topics.points_key(self._map_id), schema, payload, zenoh.Priority.DATA_LOW)
+            key, low = topics.points_key(self._map_id), zenoh.Priority.DATA_LOW
+            self._put(key, tile[0].schema, tile_payload(*tile), low)
 
     def _put_planes(self, update: MapUpdate) -> None:
         for plane in update.changed:
@@ -159,9 +159,10 @@ def encoding_of(schema: str) -> zenoh.Encoding:
     return zenoh.Encoding.APPLICATION_PROTOBUF.with_schema(schema)
 
 
-def thinned(tile: TilePoints) -> TilePoints:
-    """At most MAX_TILE_BYTES on the wire, ten bytes a voxel."""
+def tile_payload(envelope: Envelope, tile: TilePoints) -> bytes:
+    """The tile as it travels: a large one thinned to MAX_TILE_BYTES, ten bytes a voxel."""
     step = -(-len(tile.plane_ids) * 10 // MAX_TILE_BYTES)
     if step <= 1:
-        return tile
-    return TilePoints(tile.tile, tile.voxel_m, tile.centroids[::step], tile.plane_ids[::step])
+        return bytes(envelope.payload)
+    thin = replace(tile, centroids=tile.centroids[::step], plane_ids=tile.plane_ids[::step])
+    return encode(thin)[1]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 
-from facet_protocol.messages import MapUpdate, Plane, TilePoints, Tombstone
+from facet_protocol.messages import Envelope, MapUpdate, Plane, TilePoints, Tombstone
 
 MAX_TOMBSTONES = 10_000  # a client further behind than these gets everything
 
@@ -20,20 +20,20 @@ class Snapshots:
         self._forgotten = 0  # tombstones up to this revision are gone
         self._revision = 0
         self._stamp_ns = 0
-        self._tiles: dict[tuple[int, int, int], TilePoints] = {}
+        self._tiles: dict[tuple[int, int, int], tuple[Envelope, TilePoints]] = {}
 
     @property
     def num_planes(self) -> int:
         return len(self._planes)
 
-    def apply_tile(self, tile: TilePoints) -> None:
+    def apply_tile(self, envelope: Envelope, tile: TilePoints) -> None:
         """The newest points of one tile; an empty one is forgotten."""
         with self._lock:
             self._tiles.pop(tile.tile, None)
             if len(tile.plane_ids):
-                self._tiles[tile.tile] = tile
+                self._tiles[tile.tile] = (envelope, tile)
 
-    def tiles(self) -> list[TilePoints]:
+    def tiles(self) -> list[tuple[Envelope, TilePoints]]:
         """Every tile that has points, as last sent."""
         with self._lock:
             return [self._tiles[tile] for tile in sorted(self._tiles)]

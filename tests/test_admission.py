@@ -1,0 +1,70 @@
+"""Which messages become scans, and under what name the others are counted."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from facet.admission import Admission
+from facet.sources.naming import robot_and_sensor
+from facet.status import Account
+from facet_protocol.messages import Envelope, Pose
+from rig import room, room_scan, scan_envelope, unnumbered
+
+
+def admit(*envelopes: Envelope) -> tuple[list[int], dict[str, int]]:
+    """(stamps of what was admitted, what was counted)."""
+    account = Account()
+    admission = Admission(account, "map", 8.0)
+    scans = [admission.admit(envelope) for envelope in envelopes]
+    counted = {n: v for n, v in account.counters().items() if "[" not in n}
+    return [scan.sequence for scan in scans if scan is not None], counted
+
+
+def test_every_scan_once() -> None:
+    a, b, c = room(3)
+    assert admit(a, b, a, c, b) == ([1, 2, 3], {"duplicate": 2})
+
+
+def test_the_same_sequence_of_another_epoch_or_robot_is_another_scan() -> None:
+    a = room(1)[0]
+    assert admit(a, replace(a, epoch=6), room(1, "r2")[0]) == ([1, 1, 1], {})
+
+
+def test_without_a_sequence_stamp_and_bytes_decide() -> None:
+    a, b = (unnumbered(e) for e in room(2))
+    other = replace(a, payload=scan_envelope(room_scan(9)).payload)
+    assert len(admit(a, b, a, other)[0]) == 3
+
+
+def test_what_is_no_good_scan_is_counted_by_reason() -> None:
+    good = room(1)[0]
+    scan = room_scan(2)
+    elsewhere = scan_envelope(replace(scan, frame_id="sensor"))
+    turned = Pose(scan.pose.position, np.array([0.0, 0.0, 0.0, 1.1]))
+    admitted, counted = admit(
+        replace(good, payload=b""),
+        replace(good, schema="facet.v9.Scan"),
+        elsewhere,
+        scan_envelope(replace(scan, pose=turned)),
+        good,
+    )
+    assert admitted == [1]
+    assert counted == {
+        "rejected.malformed": 1,
+        "rejected.unknown_schema": 1,
+        "rejected.wrong_frame": 1,
+        "rejected.bad_quaternion": 1,
+    }
+
+
+def test_a_bad_message_does_not_use_up_its_sequence() -> None:
+    good = room(1)[0]
+    assert admit(replace(good, payload=good.payload[:40]), good)[0] == [1]
+
+
+def test_a_topic_from_elsewhere_gets_a_name() -> None:
+    assert robot_and_sensor("facet/v1/map/robot/r1/scan/front") == ("r1", "front")
+    assert robot_and_sensor("/velodyne/points 2") == ("recording", "velodyne_points_2")
+    assert robot_and_sensor("../..") == ("recording", "scan")

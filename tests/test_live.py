@@ -1,0 +1,137 @@
+"""Scans over real Zenoh sessions on this machine: counted, bounded, recovered."""
+
+from __future__ import annotations
+
+from dataclasses import astuple
+from types import SimpleNamespace
+from typing import Any
+
+from facet.commands.play import RobotPublisher
+from facet.sources.live import Inbox, LiveSource, split_encoding
+from facet_protocol import attachment
+from facet_protocol.messages import Envelope
+from rig import room, service_and_client, wait_until
+
+KEY = "facet/v1/map/robot/r1/scan/front"
+
+
+def take_all(inbox: Inbox, num: int) -> list[Envelope]:
+    taken: list[Envelope] = []
+    wait_until(lambda: taken.extend(inbox.take(0.01, 1 << 20)) or len(taken) >= num)
+    return taken
+
+
+def sample(sequence: int, size: int = 10) -> Any:
+    """What Zenoh hands to the inbox, as far as the inbox looks."""
+    mark = attachment.pack(9, sequence, sequence * 1000) if sequence else None
+    return SimpleNamespace(
+        payload=Payload(size),
+        attachment=SimpleNamespace(to_bytes=lambda: mark) if mark else None,
+        encoding="application/protobuf;foxglove.PointCloud",
+        key_expr=KEY,
+    )
+
+
+class Payload:
+    def __init__(self, size: int) -> None:
+        self._size = size
+
+    def __len__(self) -> int:
+        return self._size
+
+    def to_bytes(self) -> bytes:
+        return b"x" * self._size
+
+
+def test_a_scan_arrives_as_it_was_sent() -> None:
+    sent = room(3)
+    with service_and_client() as (service, client):
+        inbox = Inbox(100, 1 << 24, lambda: 42)
+        source = LiveSource(service, "map", inbox)
+        publisher = RobotPublisher(client, "map")
+        for envelope in sent:
+            publisher.publish("r1", "front", envelope)
+        received = take_all(inbox, 3)
+        publisher.close()
+        source.close()
+    assert [e.sequence for e in received] == [1, 2, 3]
+    assert len({e.epoch for e in received}) == 1
+    assert all(e.key == KEY and e.received_ns == 42 for e in received)
+    assert [(e.schema, e.encoding) for e in received] == [("foxglove.PointCloud", "protobuf")] * 3
+    assert [e.stamp_ns for e in received] == [e.stamp_ns for e in sent]
+    assert [e.payload for e in received] == [e.payload for e in sent]
+
+
+def test_another_map_and_another_key_stay_outside() -> None:
+    with service_and_client() as (service, client):
+        inbox = Inbox(100, 1 << 24)
+        source = LiveSource(service, "map", inbox)
+        publisher = RobotPublisher(client, "map")
+        client.put("facet/v1/other/robot/r1/scan/front", b"x")
+        client.put("facet/v1/map/robot/r1/pose", b"x")
+        publisher.publish("r1", "front", room(1)[0])
+        assert len(take_all(inbox, 1)) == 1
+        publisher.close()
+        source.close()
+    assert inbox.num_received == 1
+
+
+def test_a_message_that_is_too_large_is_cut_in_the_transport() -> None:
+    """16 MiB is the limit; also for what an advanced publisher sends again."""
+    with service_and_client() as (service, client):
+        inbox = Inbox(100, 1 << 30)
+        source = LiveSource(service, "map", inbox)
+        client.put(KEY, bytes((16 << 20) + 1))
+        client.put(KEY, bytes(100))
+        assert [len(e.payload) for e in take_all(inbox, 1)] == [100]
+        source.close()
+
+
+def test_without_an_attachment_there_is_no_sequence() -> None:
+    inbox = Inbox(10, 1 << 20, lambda: 42)
+    inbox.push(sample(0))
+    (envelope,) = inbox.take(0.0, 1 << 20)
+    assert (envelope.epoch, envelope.sequence, envelope.stamp_ns) == (0, 0, 42)
+
+
+def test_the_oldest_is_shed_and_remembered() -> None:
+    inbox = Inbox(3, 1 << 20, lambda: 42)
+    for sequence in range(1, 8):
+        inbox.push(sample(sequence))
+    assert [e.sequence for e in inbox.take(0.0, 1 << 20)] == [5, 6, 7]
+    (loss,) = inbox.take_shed()
+    assert astuple(loss) == ("r1", "front", 9, 1, 4, "shed_overload", 42)
+    assert inbox.take_shed() == []
+
+
+def test_bytes_are_bounded_too() -> None:
+    inbox = Inbox(1000, 1000)
+    for sequence in range(1, 21):
+        inbox.push(sample(sequence, size=100))
+        assert inbox.num_bytes <= 1000
+    (loss,) = inbox.take_shed()
+    assert (loss.first_sequence, loss.count) == (1, 10)
+    assert [e.sequence for e in inbox.take(0.0, 450)] == [11, 12, 13, 14, 15]
+    assert len(inbox) == 5
+    assert inbox.num_bytes == 500
+
+
+def test_one_huge_message_is_kept() -> None:
+    inbox = Inbox(10, 100)
+    inbox.push(sample(1, size=500))
+    assert len(inbox) == 1
+
+
+def test_waiting_ends_when_it_is_woken() -> None:
+    inbox = Inbox(10, 100)
+    inbox.wake()
+    assert inbox.take(60.0, 100) == []
+
+
+def test_encodings() -> None:
+    assert split_encoding("application/protobuf;foxglove.PointCloud") == (
+        "foxglove.PointCloud",
+        "protobuf",
+    )
+    assert split_encoding("application/cdr;sensor_msgs/msg/PointCloud2")[1] == "cdr"
+    assert split_encoding("zenoh/bytes") == ("", "zenoh/bytes")
