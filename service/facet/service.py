@@ -36,6 +36,7 @@ logger = logging.getLogger(__name__)
 DRAIN_S = 1.0  # at the end: for what has come in to become durable
 LAST_UPDATE_S = 2.5  # at the end: no update starts later than this after `stop`
 JOIN_S = 5.0
+ANSWER_S = 10.0
 
 
 @dataclass(slots=True)
@@ -192,6 +193,7 @@ class Service:
     def _pause(self, parameters: Mapping[str, str]) -> Mapping[str, Any]:
         """Scans are recorded, and wait; when their queue is full, the oldest at the door go."""
         self._running.clear()
+        self._on_mapper(lambda: None)  # what it had begun has ended
         return {"paused": True}
 
     def _resume(self, parameters: Mapping[str, str]) -> Mapping[str, Any]:
@@ -209,14 +211,18 @@ class Service:
         if name not in FORMATS:
             raise CommandError(f"format={name!r} is not one of {', '.join(FORMATS)}")
         path = Path(self._config.record.directory) / f"model.{name}"
-        task = Task(lambda: (self._model(), self._mapper.points()), Future())
-        self._tasks.put(task)
-        try:
-            model, tiles = task.result.result(timeout=10.0)
-        except TimeoutError:
-            raise CommandError("the mapper is busy: ask again") from None
+        model, tiles = self._on_mapper(lambda: (self._model(), self._mapper.points()))
         FORMATS[name](model, tiles, path)
         return {"path": str(path), "planes": len(model["planes"])}
+
+    def _on_mapper(self, run: Callable[[], Any]) -> Any:
+        """The result of `run`, on the thread that owns the map, between two updates."""
+        task = Task(run, Future())
+        self._tasks.put(task)
+        try:
+            return task.result.result(timeout=ANSWER_S)
+        except TimeoutError:
+            raise CommandError("the mapper is busy: ask again") from None
 
 
 def _not_yet(cause: str) -> Callable[[Mapping[str, str]], Mapping[str, Any]]:
