@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,6 +13,8 @@ from facet.config import Config, ConfigError
 
 if TYPE_CHECKING:
     from facet.mapping.mapper import Mapper
+
+logger = logging.getLogger(__name__)
 
 VoxelOption = Annotated[float | None, typer.Option("--voxel", help="Voxel edge in metres.")]
 ThetaOption = Annotated[
@@ -28,8 +31,13 @@ def make_mapper(config: Config, recorded: Mapping[str, Any] | None = None) -> Ma
     from facet.mapping.mapper import Mapper
     from facet.mapping.settings import MapSettings
 
+    known = MapSettings().as_dict()
+    unknown = sorted(set(recorded or {}) - set(known))
+    if unknown:  # of a log that another version wrote
+        logger.warning("settings of the log that this version does not have: %s", unknown)
+    repeated = {name: value for name, value in (recorded or {}).items() if name in known}
     try:
-        settings = MapSettings(**{**(recorded or {}), **config.mapping.given()})
+        settings = MapSettings(**{**repeated, **config.mapping.given()})
     except (TypeError, ValueError) as error:
         raise ConfigError(str(error)) from error
     return Mapper(settings, config.map.id)

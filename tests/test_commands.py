@@ -1,0 +1,316 @@
+"""The command: what each answers, its exit code, and one whole run in processes of their own."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import zenoh
+from typer.testing import CliRunner
+
+from facet import __version__
+from facet.__main__ import app
+from facet.commands.imports import _nanoseconds
+from facet.session import client_settings, open_session
+from facet.sinks.log_file import write_recording
+from facet.sources.recording import Recording
+from facet_protocol.codec import decode
+from facet_protocol.messages import Scan
+from facet_protocol.topics import alive_key
+from rig import free_endpoint, room, wait_until
+
+COMMANDS = (
+    *("run", "play", "status", "top", "cmd", "replay", "simulate"),
+    *("export", "info", "digest", "demo", "import"),
+)
+DATA = Path(__file__).parents[2] / "shared" / "data"
+
+
+def facet(*arguments: object, code: int = 0) -> str:
+    """The output of a command run in this process."""
+    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    assert result.exit_code == code, result.output + repr(result.exception)
+    return result.output
+
+
+def process(*arguments: object) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "facet", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+
+
+def hashes(output: str) -> dict[str, str]:
+    lines = (line.split() for line in output.splitlines())
+    return {words[0]: words[1] for words in lines if words and words[0] in ("state", "derived")}
+
+
+@pytest.fixture
+def log(tmp_path: Path) -> Path:
+    path = tmp_path / "room.mcap"
+    write_recording(path, room(6), {"map": "room", "frame": "map"})
+    return path
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command: str) -> None:
+    text = facet(command, "--help")
+    assert f"facet {command}" in text or command in ("top",)  # an example
+
+
+def test_version() -> None:
+    assert facet("--version").strip() == f"facet {__version__}"
+
+
+def test_replay_gives_the_map_its_report_and_its_files(log: Path, tmp_path: Path) -> None:
+    text = facet("replay", log, "--voxel", 0.1, "--out", tmp_path / "out", "--report")
+    assert "27,000" in text  # points
+    assert "detail level" in text
+    model = json.loads((tmp_path / "out" / "model.json").read_text())
+    assert model["map"]["id"] == "room"
+    assert model["settings"]["voxel_m"] == 0.1
+    assert hashes(text) == model["digest"]
+    assert (tmp_path / "out" / "picture.png").stat().st_size > 1000
+
+
+def test_two_replays_write_the_same_updates(log: Path, tmp_path: Path) -> None:
+    written = []
+    for name in ("a.mcap", "b.mcap"):
+        facet("replay", log, "--voxel", 0.1, "--updates", tmp_path / name)
+        written.append((tmp_path / name).read_bytes())
+    assert written[0] == written[1]
+
+
+@pytest.mark.parametrize("every", ["log", "0.1", "end"])
+def test_the_map_does_not_depend_on_the_cuts(log: Path, every: str) -> None:
+    text = facet("replay", log, "--voxel", 0.1, "--update-every", every)
+    once = facet("replay", log, "--voxel", 0.1, "--update-every", "end")
+    assert hashes(text) == hashes(once)
+
+
+def test_digest_of_a_log_and_of_its_model(log: Path, tmp_path: Path) -> None:
+    facet("replay", log, "--out", tmp_path)
+    of_log, of_model = facet("digest", log), facet("digest", tmp_path / "model.json")
+    assert hashes(of_log)["derived"] == hashes(of_model)["derived"]
+    model = json.loads((tmp_path / "model.json").read_text())
+    model["planes"][0]["d"] += 1e-9
+    (tmp_path / "model.json").write_text(json.dumps(model))
+    facet("digest", tmp_path / "model.json", code=65)
+
+
+def test_a_cut_off_log_is_replayed_and_said_to_be_cut_off(log: Path) -> None:
+    whole = log.read_bytes()
+    log.write_bytes(whole[: len(whole) - 40])
+    text = facet("replay", log, "--voxel", 0.1, code=3)
+    assert "cut off" in text
+    assert "cut off" in facet("info", log, code=3)
+
+
+def test_what_is_left_out_is_counted(log: Path) -> None:
+    scans = room(6)
+    scans[2] = replace(scans[2], payload=b"\x01\x02")
+    write_recording(log, scans, {})
+    assert "1 malformed" in facet("replay", log, "--voxel", 0.1, code=3)
+
+
+def test_info(log: Path, tmp_path: Path) -> None:
+    text = facet("info", log)
+    assert "r1/lidar" in text
+    assert "foxglove.PointCloud" in text
+    facet("replay", log, "--out", tmp_path)
+    assert "floor" in facet("info", tmp_path / "model.json")
+
+
+def test_export_from_a_log_and_from_a_model(log: Path, tmp_path: Path) -> None:
+    facet("export", log, tmp_path / "points.ply")
+    facet("export", log, tmp_path / "model.json")
+    facet("export", tmp_path / "model.json", tmp_path / "rooms.glb")
+    assert (tmp_path / "rooms.glb").read_bytes().startswith(b"glTF")
+    assert (tmp_path / "points.ply").read_bytes().startswith(b"ply")
+
+
+def test_simulate_writes_scans_and_their_truth(tmp_path: Path) -> None:
+    out = tmp_path / "s.mcap"
+    facet("simulate", out, "--scene", "corridor", "--duration", 0.2, "--robot", "r7")
+    assert {e.key for e in Recording([out])} == {"facet/v1/map/robot/r7/scan/pushbroom"}
+    truth = json.loads((tmp_path / "s.truth.json").read_text())
+    assert truth["scene"] == "corridor"
+
+
+def scans_of(path: Path) -> list[Scan]:
+    return [scan for e in Recording([path]) if isinstance(scan := decode(e), Scan)]
+
+
+def test_import_npz(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    points = rng.normal(size=(30, 3)).astype(np.float32)
+    turn = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 1]])
+    np.savez(
+        tmp_path / "a.npz",
+        stamp_ns=np.array([5, 9]),
+        T_world_sensor=np.stack([np.eye(4), turn]),
+        points=points,
+        lengths=np.array([10, 20]),
+    )
+    facet("import", tmp_path / "a.npz", tmp_path / "a.mcap")
+    first, second = scans_of(tmp_path / "a.mcap")
+    assert np.array_equal(first.points, points[:10])
+    assert np.array_equal(second.points, points[10:])
+    assert (first.stamp_ns, second.stamp_ns) == (5, 9)
+    assert second.pose.position.tolist() == [1, 2, 3]
+    half = np.sqrt(0.5)
+    assert np.allclose(second.pose.orientation_xyzw, [0, 0, half, half])
+
+
+@pytest.mark.skipif(not DATA.exists(), reason="the shared recordings are not here")
+def test_import_a_real_recording(tmp_path: Path) -> None:
+    facet("import", DATA / "rooms.npz", tmp_path / "rooms.mcap")
+    scans = scans_of(tmp_path / "rooms.mcap")
+    with np.load(DATA / "rooms.npz") as data:
+        assert [len(s.points) for s in scans] == data["lengths"].tolist()
+
+
+PCD = """VERSION .7
+FIELDS x y z
+SIZE 4 4 4
+TYPE F F F
+COUNT 1 1 1
+WIDTH 2
+HEIGHT 1
+VIEWPOINT 0 0 0 1 0 0 0
+POINTS 2
+DATA ascii
+1 2 3
+4 5 6
+"""
+PLY = """ply
+format ascii 1.0
+element vertex 2
+property float x
+property float y
+property float z
+end_header
+1 2 3
+4 5 6
+"""
+
+
+@pytest.mark.parametrize(("name", "text"), [("0.ply", PLY), ("0.pcd", PCD)])
+def test_import_clouds_with_poses(tmp_path: Path, name: str, text: str) -> None:
+    if name.endswith("pcd"):
+        pytest.importorskip("pypcd4")
+    folder = tmp_path / "clouds"
+    folder.mkdir()
+    (folder / name).write_text(text)
+    (folder / name.replace("0", "1")).write_text(text)
+    poses = tmp_path / "poses.txt"
+    poses.write_text("# stamp x y z qx qy qz qw\n1.000000001 0 0 1 0 0 0 1\n2.5 1 0 1 0 0 0 1\n")
+    facet("import", folder, tmp_path / "a.mcap", "--poses", poses)
+    first, second = scans_of(tmp_path / "a.mcap")
+    assert first.points.tolist() == [[1, 2, 3], [4, 5, 6]]
+    assert (first.stamp_ns, second.stamp_ns) == (1_000_000_001, 2_500_000_000)
+    assert second.pose.position.tolist() == [1, 0, 1]
+
+
+def test_stamps_are_exact() -> None:
+    assert _nanoseconds("1700000000.123456789") == 1_700_000_000_123_456_789
+    assert _nanoseconds("12") == 12_000_000_000
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (("replay", "nowhere.mcap"), 65, "nowhere.mcap: no such file"),
+        (("replay", __file__), 65, "not an MCAP file"),
+        (("replay", __file__, "--voxel", "9"), 78, "mapping.voxel_m = 9.0"),
+        (("replay", __file__, "--update-every", "never"), 2, "never"),
+        (("run", "--listen", "tcp/0.0.0.0:7447"), 78, "open to the network"),
+        (("run", "--viewer", "vr"), 78, "viewer"),
+        (("status", "--connect", "tcp/127.0.0.1:9"), 74, "onnect"),
+        (("simulate", "x.mcap", "--scene", "castle"), 2, "castle"),
+    ],
+)
+def test_exit_codes(
+    arguments: tuple[str, ...], code: int, said: str, tmp_path: Path, monkeypatch: Any
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    result = process(*arguments)
+    assert result.returncode == code, result.stderr
+    assert said in result.stderr
+    assert "Traceback" not in result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+class Running:
+    """`facet run` in a process of its own."""
+
+    def __init__(self, folder: Path, *arguments: object) -> None:
+        self.endpoint, self.folder = free_endpoint(), folder
+        folder.mkdir(exist_ok=True)
+        options = ["run", "--listen", self.endpoint, "--record", folder, "--voxel", 0.1]
+        command = [sys.executable, "-m", "facet", *map(str, [*options, *arguments])]
+        with (folder / "stderr.txt").open("w") as stderr:
+            self.process = subprocess.Popen(
+                command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=os.environ.copy()
+            )
+        wait_until(self.is_ready, 60)
+
+    def is_ready(self) -> bool:
+        assert self.process.poll() is None, (self.folder / "stderr.txt").read_text()
+        try:
+            with open_session(client_settings(self.endpoint, shared_memory=False)) as session:
+                return bool(list(session.liveliness().get(alive_key("map"))))
+        except zenoh.ZError:
+            return False
+
+    def stop(self, number: int = signal.SIGTERM) -> tuple[int, str]:
+        """(exit code, standard output); it has five seconds."""
+        self.process.send_signal(number)
+        output, _ = self.process.communicate(timeout=5)
+        return self.process.returncode, output
+
+
+def test_run_play_stop_replay(log: Path, tmp_path: Path) -> None:
+    """A robot's scans through a running service, SIGTERM, and the same map again from its log."""
+    service = Running(tmp_path / "log")
+    try:
+        played = process("play", log, "--connect", service.endpoint, "--speed", "max")
+        assert played.returncode == 0, played.stderr
+        assert "played 6 scans" in played.stdout
+        status = process("status", "--connect", service.endpoint)
+        assert status.returncode == 0, status.stderr
+        code, output = service.stop()
+    finally:
+        service.process.kill()
+        service.process.wait()
+    assert code == 0, output
+    assert "recorded 6 of 6 received (100.0 %), lost upstream 0" in output
+    model = json.loads((tmp_path / "log" / "model.json").read_text())
+    assert hashes(facet("replay", tmp_path / "log")) == model["digest"]
+    assert hashes(facet("replay", log, "--voxel", 0.1)) == model["digest"]
+
+
+def test_killed_at_any_moment_the_log_is_whole_chunks(log: Path, tmp_path: Path) -> None:
+    service = Running(tmp_path / "log")
+    process("play", log, "--connect", service.endpoint, "--speed", "max")
+    recorded = tmp_path / "log"
+    wait_until(lambda: any(p.stat().st_size > 300_000 for p in recorded.glob("*.mcap")))
+    service.process.kill()
+    service.process.communicate()
+    assert "6" in facet("replay", recorded, code=3)
+    again = Running(tmp_path / "log")  # the lock died with the process
+    assert again.stop(signal.SIGINT)[0] == 0
+
+
+def test_a_second_service_does_not_write_the_same_log(tmp_path: Path) -> None:
+    service = Running(tmp_path / "log")
+    second = process("run", "--listen", free_endpoint(), "--record", tmp_path / "log")
+    assert service.stop()[0] == 0
+    assert second.returncode == 74
+    assert "another service" in second.stderr
