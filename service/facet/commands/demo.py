@@ -78,8 +78,7 @@ def _map_live(source: Path, num_scans: int, out_dir: Path, speed: str) -> float:
     robot = ["play", str(source), "--map", MAP, "--connect", endpoint, "--speed", speed]
     log = out_dir / "service.txt"
     with log.open("wb") as service_out, _child(service, service_out) as running:
-        session_of = _connected(endpoint, running, log)
-        with session_of as session:
+        with _connected(endpoint, running, log) as session:
             started = time.monotonic()
             with _child(robot, subprocess.DEVNULL) as playing:
                 _follow(session, num_scans, playing, running)
@@ -116,6 +115,8 @@ def _connected(
     import zenoh
 
     deadline = time.monotonic() + READY_S
+    if err.is_terminal:
+        err.print("starting the service; the first time it is compiled, which takes a minute")
     while running.poll() is None and time.monotonic() < deadline:
         try:
             with open_session(client_settings(endpoint)) as session:
