@@ -56,7 +56,7 @@ def test_the_whole_office_lands_in_the_file(tmp_path):
     rows = _entities(tmp_path / "m.rrd")
     planes = [p for p in rows if p.startswith("/map/planes/") and p.endswith("/outline")]
     assert len(planes) == len(office.planes())
-    assert len([p for p in rows if p.startswith("/map/points/")]) == len(tiles)
+    assert len([p for p in rows if p.startswith("/map/points/below/")]) == len(tiles)
     assert {"/stages/normals", "/area/wall", "/gauges/voxels", "/events"} <= rows.keys()
     assert len(rows["/events"]) == len(updates)
     assert rows["/events"][0]["stamp"].timestamp() == pytest.approx(office.STAMP_NS / 1e9)
@@ -115,13 +115,15 @@ def test_a_plane_that_changes_class_moves(tmp_path):
     assert f"/map/planes/floor/{ramp.id}/surface" in rows
 
 
-def test_updates_in_quick_succession_are_drawn_once(tmp_path):
+@pytest.mark.parametrize(("shift_m", "num_drawn"), [(0.01, 2), (1e-6, 1)])
+def test_updates_in_quick_succession_are_drawn_once(tmp_path, shift_m, num_drawn):
     viewer = RrdViewer(tmp_path / "m.rrd")
     for k in range(200):
         stamp_ns = office.STAMP_NS + k * 10**6  # 0.2 s in all
-        viewer.write_update(MapUpdate("office", k + 1, k, stamp_ns, office.planes()[:1], (), ()))
+        floor = replace(office.planes()[0], d=k * shift_m)
+        viewer.write_update(MapUpdate("office", k + 1, k, stamp_ns, (floor,), (), ()))
     viewer.close()
-    assert len(_entities(tmp_path / "m.rrd")["/map/planes/floor/1/surface"]) == 2
+    assert len(_entities(tmp_path / "m.rrd")["/map/planes/floor/1/surface"]) == num_drawn
 
 
 def test_nothing_that_is_not_a_number_is_drawn(tmp_path):
@@ -154,8 +156,8 @@ def test_a_callers_array_may_change_afterwards(tmp_path):
     assert rows["/robots/r1/marker"][0]["Transform3D:translation"] == [[1.0, 2.0, 3.0]]
     name = "_".join(str(k) for k in tile.tile)
     drawn = [
-        p for kind in ("points", "ceiling")
-        for p in rows[f"/map/{kind}/{name}"][0].get("Points3D:positions") or []
+        p for kind in ("below", "overhead")
+        for p in rows[f"/map/points/{kind}/{name}"][0].get("Points3D:positions") or []
     ]  # fmt: skip
     np.testing.assert_allclose(sorted(map(tuple, drawn)), sorted(map(tuple, expected)))
 

@@ -1,11 +1,14 @@
 """The plan reads walls, doors and windows as they stand; the cutaway hides what is behind."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import office
 from facet.export import cutaway
 from facet.export.floorplan import Piece, floor_level, wall_segments
+from facet.export.viewpoint import corners, is_overhead, turned, view_rotation, walls_azimuth
 
 PLANES = {plane.id: plane for plane in office.planes()}
 
@@ -48,7 +51,7 @@ def test_floor_level(planes, level):
 
 def test_a_nearer_wall_hides_the_one_behind():
     wall, behind = PLANES[11], PLANES[12]  # inward +y and inward -y: only the second is seen
-    R_view_world = cutaway.view_rotation([wall])
+    R_view_world = view_rotation([wall])
     canvas = cutaway.Canvas.fit(behind.lift(behind.surfaces[0].outer), R_view_world, 120, 90)
     canvas.fill(PLANES[16])
     before = canvas.colour.copy()
@@ -61,6 +64,20 @@ def test_a_nearer_wall_hides_the_one_behind():
 
 
 def test_view_is_a_rotation():
-    R = cutaway.view_rotation(office.planes())
+    R = view_rotation(office.planes())
     np.testing.assert_allclose(R @ R.T, np.eye(3), atol=1e-12)
     assert np.linalg.det(R) == pytest.approx(1.0)
+
+
+def test_a_building_that_stands_askew_is_turned_straight():
+    askew = [turned(plane, -0.3) for plane in office.planes()]
+    assert walls_azimuth(askew) == pytest.approx(0.3)
+    straight = corners(turned(plane, 0.3) for plane in askew)
+    np.testing.assert_allclose(straight, corners(office.planes()), atol=1e-9)
+
+
+def test_a_slope_that_looks_down_is_overhead():
+    ramp = PLANES[23]
+    assert not is_overhead(ramp)
+    assert is_overhead(replace(ramp, facing=-ramp.facing))
+    assert [plane.id for plane in PLANES.values() if is_overhead(plane)] == [2]

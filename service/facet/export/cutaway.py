@@ -15,14 +15,13 @@ from PIL import Image, ImageDraw
 
 from facet.export.colours import CLASS_COLOURS, HOLE_COLOURS, Rgb
 from facet.export.triangles import inward_normal
-from facet_protocol.messages import HoleKind, Plane, PlaneClass
+from facet.export.viewpoint import corners, is_overhead, view_rotation
+from facet_protocol.messages import HoleKind, Plane
 
 Points = NDArray[np.float64]
 PAPER: Rgb = (255, 255, 255)
 INK: Rgb = (58, 62, 70)
 OVERSAMPLE = 2
-ELEVATION = np.radians(48.0)
-TURN = np.radians(28.0)  # off the walls' own direction, so that no wall is seen edge on
 LIGHT = np.array([-0.62, 0.35, 0.70])  # towards the lamp, view: upper left, behind the viewer
 LIFT_M = 0.02  # outlines lie this much nearer to the viewer than their plane
 
@@ -31,10 +30,10 @@ def render(planes: Sequence[Plane], width: int, height: int) -> Image.Image:
     """A picture of the planes, fitted to width x height pixels."""
     shown = [plane for plane in planes if plane.surfaces]
     R_view_world = view_rotation(shown)
-    corners = [p.lift(s.outer) for p in shown for s in p.surfaces if not _is_ceiling(p)]
-    canvas = Canvas.fit(np.concatenate([np.zeros((0, 3)), *corners]), R_view_world, width, height)
+    below = [plane for plane in shown if not is_overhead(plane)]
+    canvas = Canvas.fit(corners(below), R_view_world, width, height)
     near = [plane for plane in shown if inward_normal(plane) @ R_view_world[2] > 0.02]
-    far = [plane for plane in shown if not _is_ceiling(plane) and plane not in near]
+    far = [plane for plane in below if plane not in near]
     for plane in near:
         canvas.fill(plane)
     for plane in near:
@@ -43,24 +42,6 @@ def render(planes: Sequence[Plane], width: int, height: int) -> Image.Image:
     for plane in far:
         canvas.ghost(plane)
     return canvas.picture(width, height)
-
-
-def _is_ceiling(plane: Plane) -> bool:
-    return plane.plane_class is PlaneClass.CEILING
-
-
-def view_rotation(planes: Sequence[Plane]) -> NDArray[np.float64]:
-    """(3, 3) rows right, up, towards the viewer: from the south, turned off the walls."""
-    fold = 0.0 + 0.0j  # walls a quarter turn apart count as one direction
-    for plane in planes:
-        if plane.plane_class is PlaneClass.WALL:
-            angle = np.arctan2(plane.normal[1], plane.normal[0])
-            fold += sum(s.area_m2 for s in plane.surfaces) * np.exp(4j * angle)
-    azimuth = float(np.angle(fold)) / 4.0 - np.pi / 2.0 + TURN
-    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
-    level = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
-    towards = np.cos(ELEVATION) * level + np.sin(ELEVATION) * np.array([0.0, 0.0, 1.0])
-    return np.stack([right, np.cross(towards, right), towards])
 
 
 @dataclass

@@ -20,6 +20,7 @@ from facet.export import cutaway
 from facet.export.colours import CLASS_COLOURS, HOLE_COLOURS, Rgb
 from facet.export.floorplan import CUT_M, Piece, Segment, floor_level, wall_segments
 from facet.export.model import Model, planes_of
+from facet.export.viewpoint import corners, is_overhead, turned, walls_azimuth
 from facet_protocol.messages import HoleKind, Plane, PlaneClass, Surface
 
 INCHES = (20.0, 9.6)
@@ -54,15 +55,17 @@ def _draw_plan(axes: Axes, planes: Sequence[Plane]) -> None:
     axes.set_aspect("equal")
     axes.set_axis_off()
     level = floor_level(planes)
-    for plane in planes:
+    azimuth = walls_azimuth(planes)
+    aligned = [turned(plane, azimuth) for plane in planes if not is_overhead(plane)]
+    for plane in aligned:
         for surface in plane.surfaces:
             if plane.plane_class is PlaneClass.WALL:
                 _draw_wall(axes, plane, surface, level)
-            elif plane.plane_class is not PlaneClass.CEILING:
+            else:
                 _draw_ground(axes, plane, surface)
-    drawn = [p.lift(s.outer)[:, :2] for p in planes for s in p.surfaces]
-    if drawn:
-        _draw_measures(axes, np.concatenate(drawn))
+    drawn = corners(aligned)
+    if len(drawn):
+        _draw_measures(axes, drawn[:, :2], azimuth)
 
 
 def _draw_ground(axes: Axes, plane: Plane, surface: Surface) -> None:
@@ -135,7 +138,7 @@ PIECES = {
 }
 
 
-def _draw_measures(axes: Axes, points: NDArray[np.float64]) -> None:
+def _draw_measures(axes: Axes, points: NDArray[np.float64], azimuth: float) -> None:
     """Overall dimensions, scale bar and the map's axes, below and to the left of the plan."""
     low, high = points.min(axis=0), points.max(axis=0)
     size = high - low
@@ -154,7 +157,7 @@ def _draw_measures(axes: Axes, points: NDArray[np.float64]) -> None:
     axes.text((low[0] + high[0]) / 2, below, f"{size[0]:.2f} m", **words)
     axes.text(left, (low[1] + high[1]) / 2, f"{size[1]:.2f} m", rotation=90, **words)
     _draw_scale_bar(axes, low[0], below - 1.2 * gap, float(size.max()))
-    _draw_axes_mark(axes, high[0] - gap, below - 1.4 * gap, gap)
+    _draw_axes_mark(axes, high[0] - gap, below - 1.4 * gap, gap, azimuth)
     words = {"color": INK, "size": 12, "ha": "center", "va": "bottom"}
     axes.text((low[0] + high[0]) / 2, high[1] + gap / 2, PLAN_TITLE, **words)
     axes.set_xlim(left - gap, high[0] + gap)
@@ -173,8 +176,10 @@ def _draw_scale_bar(axes: Axes, x: float, y: float, extent: float) -> None:
         axes.text(x + k * unit, y - height, text, ha="center", va="top", size=9, color=INK)
 
 
-def _draw_axes_mark(axes: Axes, x: float, y: float, length: float) -> None:
-    for name, dx, dy in (("x", length, 0.0), ("y", 0.0, length)):
+def _draw_axes_mark(axes: Axes, x: float, y: float, length: float, azimuth: float) -> None:
+    """The map's own axes: the plan is turned so that the walls lie along the page."""
+    for name, angle in (("x", -azimuth), ("y", np.pi / 2.0 - azimuth)):
+        dx, dy = length * np.cos(angle), length * np.sin(angle)
         arrow = {"arrowstyle": "-|>", "color": INK, "lw": 1.1, "shrinkA": 0, "shrinkB": 0}
         axes.annotate("", (x + dx, y + dy), (x, y), arrowprops=arrow)
         axes.text(x + 1.25 * dx, y + 1.25 * dy, name, size=9, color=INK, ha="center", va="center")

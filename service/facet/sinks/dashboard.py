@@ -13,7 +13,8 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from facet.sinks import drawing
+from facet.export.viewpoint import corners, is_overhead
+from facet.sinks import drawing, layout
 from facet_protocol.codec import Message
 from facet_protocol.messages import (
     Envelope,
@@ -30,8 +31,9 @@ from facet_protocol.messages import (
 from facet_protocol.topics import pose_topic
 
 POSE_TOPICS = pose_topic("_").removesuffix("_")
-PLANES_EVERY_NS = 250_000_000  # of stamps
-POINTS_EVERY_NS = 1_000_000_000
+NS = 1_000_000_000  # of stamps
+PLANES_EVERY_S, POINTS_EVERY_S = 0.25, 1.0  # live
+FILE_PLANES_EVERY_S, FILE_POINTS_EVERY_S = 0.5, 3.0  # a file keeps all of it
 PATH_STEP_M = 0.05  # a robot that stands still grows no path
 PATH_PIECE = 64  # positions an entity: the piece under way is drawn again, the others are done
 
@@ -57,11 +59,18 @@ class RobotPath:
 class Dashboard:
     """Everything that is drawn of one map. One thread; memory follows the map, not the time."""
 
-    def __init__(self, stream: rr.RecordingStream) -> None:
+    def __init__(
+        self,
+        stream: rr.RecordingStream,
+        planes_every_s: float = PLANES_EVERY_S,
+        points_every_s: float = POINTS_EVERY_S,
+    ) -> None:
         self._stream = stream
+        self._planes_every_ns = int(planes_every_s * NS)
+        self._points_every_ns = int(points_every_s * NS)
         self._stamp_ns = 0
         self._planes: dict[int, Plane] = {}
-        self._drawn: dict[int, str] = {}  # plane id: its entity
+        self._drawn: dict[int, Plane] = {}  # as last drawn
         self._waiting_planes: set[int] = set()
         self._waiting_tiles: dict[tuple[int, int, int], TilePoints] = {}
         self._planes_due_ns = self._points_due_ns = 0
@@ -70,7 +79,7 @@ class Dashboard:
         self._health = "OK"
         self._extent = 0.0
         stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        stream.send_blueprint(drawing.blueprint(None))
+        stream.send_blueprint(layout.blueprint(()))
 
     def draw(self, message: Message | None, topic: str = "") -> None:
         """One message of the pipeline, whatever it is; what cannot be drawn is passed over."""
@@ -138,12 +147,12 @@ class Dashboard:
     def _advance(self, stamp_ns: int) -> None:
         """Time only goes on: robots and updates arrive out of step."""
         self._stamp_ns = max(self._stamp_ns, stamp_ns)
-        self._stream.set_time(drawing.TIMELINE, timestamp=np.datetime64(self._stamp_ns, "ns"))
+        self._stream.set_time(layout.TIMELINE, timestamp=np.datetime64(self._stamp_ns, "ns"))
         if self._stamp_ns >= self._planes_due_ns and self._waiting_planes:
-            self._planes_due_ns = self._stamp_ns + PLANES_EVERY_NS
+            self._planes_due_ns = self._stamp_ns + self._planes_every_ns
             self._draw_planes()
         if self._stamp_ns >= self._points_due_ns and self._waiting_tiles:
-            self._points_due_ns = self._stamp_ns + POINTS_EVERY_NS
+            self._points_due_ns = self._stamp_ns + self._points_every_ns
             self._draw_tiles()
 
     def _draw_planes(self) -> None:
@@ -159,38 +168,42 @@ class Dashboard:
         self._fit_view()
 
     def _draw_plane(self, number: int, plane: Plane | None) -> None:
-        entity = f"map/planes/{plane.plane_class.value}/{number}" if plane else ""
-        before = self._drawn.pop(number, entity)
-        if before != entity:  # retired, or of another class now
-            self._stream.log(before, rr.Clear(recursive=True))
+        before = self._drawn.pop(number, None)
+        if before and (plane is None or _entity(before) != _entity(plane)):
+            self._stream.log(_entity(before), rr.Clear(recursive=True))
+            before = None
         if plane is None:
             return
-        self._drawn[number] = entity
+        if before and drawing.looks_the_same(before, plane):
+            self._drawn[number] = before
+            return
+        self._drawn[number] = plane
+        entity = _entity(plane)
         mesh = drawing.mesh(plane)
         self._stream.log(f"{entity}/surface", mesh or rr.Clear(recursive=False))
         self._stream.log(f"{entity}/outline", drawing.outline(plane))
 
     def _draw_tiles(self) -> None:
-        kinds = self._planes.items()
-        ceilings = [i for i, plane in kinds if plane.plane_class is PlaneClass.CEILING]
+        overhead = [i for i, plane in self._planes.items() if is_overhead(plane)]
         for key, tile in sorted(self._waiting_tiles.items()):
             name = "_".join(str(k) for k in key)
-            below, above = drawing.split_tile(tile, ceilings)
-            self._stream.log(f"map/points/{name}", drawing.points(*below))
-            self._stream.log(f"map/ceiling/{name}", drawing.points(*above))
+            below, above = drawing.split_tile(tile, overhead)
+            for kind, rows in (("below", below), (layout.OVERHEAD, above)):
+                self._stream.log(f"map/points/{kind}/{name}", drawing.points(*rows))
         self._waiting_tiles.clear()
 
     def _fit_view(self) -> None:
         """Step back when the map has outgrown the view; otherwise leave the eye to the user."""
-        bounds = drawing.bounds_of(self._planes.values())
-        extent = 0.0 if bounds is None else float(np.linalg.norm(bounds[1] - bounds[0]))
+        p = corners(self._planes.values())
+        extent = float(np.linalg.norm(np.ptp(p, axis=0))) if len(p) else 0.0
         if extent > 1.3 * self._extent:
             self._extent = extent
-            self._stream.send_blueprint(drawing.blueprint(bounds))
+            self._stream.send_blueprint(layout.blueprint([*self._planes.values()]))
 
     def fit_view_finally(self) -> None:
         """The view for someone who opens the finished file."""
-        self._stream.send_blueprint(drawing.blueprint(drawing.bounds_of(self._planes.values())))
+        has_service = any(name.startswith("stages/") for name in self._series)
+        self._stream.send_blueprint(layout.blueprint([*self._planes.values()], has_service))
 
     def _log_number(self, entity: str, value: float) -> None:
         if not np.isfinite(value):
@@ -216,6 +229,11 @@ class Dashboard:
             self._stream.log("events", rr.TextLog(text, level=rr.TextLogLevel.DEBUG))
 
 
+def _entity(plane: Plane) -> str:
+    kind = layout.OVERHEAD if is_overhead(plane) else plane.plane_class.value
+    return f"map/planes/{kind}/{plane.id}"
+
+
 class RrdViewer:
     """A sink that draws into an .rrd file; never blocks."""
 
@@ -224,7 +242,7 @@ class RrdViewer:
         self._stream.set_log_time_enabled(False)
         self._stream.set_log_tick_enabled(False)
         self._stream.save(path)
-        self._dashboard = Dashboard(self._stream)
+        self._dashboard = Dashboard(self._stream, FILE_PLANES_EVERY_S, FILE_POINTS_EVERY_S)
         self._is_open = True
         self.write_update = self._dashboard.write_update
         self.write_points = self._dashboard.write_points
