@@ -59,6 +59,14 @@ def test_what_is_no_good_scan_is_counted_by_reason() -> None:
     }
 
 
+def test_a_bad_name_is_refused_and_not_mended() -> None:
+    good = room(1)[0]
+    for robot in ("a b", "..", "x" * 65, "r\u202e1", "**"):
+        admitted, counted = admit(replace(good, key=f"facet/v1/map/robot/{robot}/scan/lidar"))
+        assert admitted == []
+        assert list(counted) in (["rejected.bad_id"], ["rejected.bad_key"])
+
+
 def test_a_bad_message_does_not_use_up_its_sequence() -> None:
     good = room(1)[0]
     assert admit(replace(good, payload=good.payload[:40]), good)[0] == [1]

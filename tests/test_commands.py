@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import psutil
 import pytest
 import zenoh
 from typer.testing import CliRunner
@@ -306,6 +307,28 @@ def test_killed_at_any_moment_the_log_is_whole_chunks(log: Path, tmp_path: Path)
     assert "6" in facet("replay", recorded, code=3)
     again = Running(tmp_path / "log")  # the lock died with the process
     assert again.stop(signal.SIGINT)[0] == 0
+
+
+def test_a_viewer_that_dies_changes_nothing(log: Path, tmp_path: Path) -> None:
+    """Its viewer has nothing to draw into, and is killed; the map goes on."""
+    service = Running(tmp_path / "log", "--viewer", "connect:rerun+http://127.0.0.1:9/proxy")
+    children = psutil.Process(service.process.pid).children
+    wait_until(lambda: len(children()) == 1)
+    children()[0].kill()
+    wait_until(lambda: not children())
+    process("play", log, "--connect", service.endpoint, "--speed", "max")
+    code, output = service.stop()
+    assert code == 0, output
+    assert "recorded 6 of 6" in output
+    assert "viewer_ended" in output
+
+
+def test_the_demo_ends_with_the_same_map_twice(log: Path, tmp_path: Path) -> None:
+    result = process("demo", "--recording", log, "--out", tmp_path / "demo", "--speed", "max")
+    assert result.returncode == 0, result.stderr + result.stdout
+    assert "live and replayed alike" in result.stdout
+    written = {path.name for path in (tmp_path / "demo").iterdir()}
+    assert {"model.json", "picture.png", "demo.rrd", "log"} <= written
 
 
 def test_a_second_service_does_not_write_the_same_log(tmp_path: Path) -> None:

@@ -9,6 +9,7 @@ from facet.sources.naming import robot_and_sensor, source_of
 from facet.status import Account
 from facet_protocol.messages import Envelope, ProtocolError, Scan
 from facet_protocol.scans import decode_scan
+from facet_protocol.topics import PREFIX, parse_scan_key
 
 
 class Admission:
@@ -37,6 +38,8 @@ class Admission:
         return scan
 
     def _decode(self, envelope: Envelope) -> Scan:
+        if envelope.key.startswith(f"{PREFIX}/"):
+            parse_scan_key(envelope.key)  # a name of ours that is none is refused, not mended
         robot, sensor = robot_and_sensor(envelope.key)
         return decode_scan(envelope, robot, sensor, self._reach_m, frame_id=self._frame_id)
 

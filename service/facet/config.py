@@ -59,7 +59,7 @@ class NetworkSection(Section):
 
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     connect: tuple[str, ...] = ()
-    max_message_bytes: int = Field(default=16 * MIB, ge=1024, le=1024 * MIB)
+    max_message_bytes: int = Field(default=16 * MIB, ge=1024, le=48 * MIB)  # a chunk: 64 MiB
     shared_memory: bool = True
     root_ca_certificate: Path | None = None
     listen_certificate: Path | None = None
@@ -100,7 +100,7 @@ class RecordSection(Section):
     compression: Literal["lz4", "zstd", "none"] = "lz4"
     max_file_bytes: int = Field(default=1024 * MIB, ge=MIB)
     max_file_s: int = Field(default=3600, ge=1)
-    min_free_bytes: int = Field(default=256 * MIB, ge=0)
+    min_free_bytes: int = Field(default=1024 * MIB, ge=0)
     retry_s: float = Field(default=5.0, gt=0.0, le=600.0)
     on_full: Literal["retry", "exit"] = "retry"
 

@@ -129,6 +129,14 @@ class Intake:
         self._thread.join(timeout_s)
 
     def _run(self) -> None:
+        try:
+            self._record_until_stopped()
+        except Exception as error:  # a fault of ours: without a log there is no map
+            logger.exception("the recorder failed")
+            self._account.failure = f"recorder: {error}"
+            self.failed.set()
+
+    def _record_until_stopped(self) -> None:
         due = time.monotonic() + self._commit_s
         while not self._stopping.is_set():
             if not self._account.failure and self._durable.wait_for_room(self._commit_s):

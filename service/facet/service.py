@@ -117,6 +117,7 @@ class Service:
         self._durable.close()
         self._mapping.join(JOIN_S)
         self._reporting.join(1.0)
+        self._say_status()
         self._answers.close()
         self._publisher.close()
         self._intake.stop(JOIN_S)
@@ -162,19 +163,24 @@ class Service:
             task.result.set_exception(error)
 
     def _report(self) -> None:
-        """The status thread: one message a period, to the network and the log."""
+        """The status thread: one message a period."""
         while not self._stopping.wait(self._config.publish.status_s):
-            self.account.gauge("queue_msgs", len(self._inbox) + len(self._durable))
-            self.account.gauge("queue_bytes", self._inbox.num_bytes)
-            self.account.gauge("recorded_bytes", self.recorder.committed_bytes)
-            self.account.gauge("planes", self._snapshots.num_planes)
-            self.account.gauge("disk_free_mb", self.recorder.free_bytes() / 1e6)
-            revision = self._pipeline.revision
-            status = self.account.status(self._config.map.id, revision, time.time_ns())
-            for sink in (self._publisher, self._intake):
-                sink.write(*self._outgoing.status(status))
+            self._say_status()
             if self._intake.failed.is_set():
                 self.ended.set()
+
+    def _say_status(self) -> None:
+        """To the network and into the log, which so carries its own account of what was lost."""
+        gauge = self.account.gauge
+        gauge("queue_msgs", len(self._inbox) + len(self._durable))
+        gauge("queue_bytes", self._inbox.num_bytes)
+        gauge("recorded_bytes", self.recorder.committed_bytes)
+        gauge("planes", self._snapshots.num_planes)
+        gauge("disk_free_mb", self.recorder.free_bytes() / 1e6)
+        revision = self._pipeline.revision
+        status = self.account.status(self._config.map.id, revision, time.time_ns())
+        for sink in (self._publisher, self._intake):
+            sink.write(*self._outgoing.status(status))
 
     def _model(self) -> Model:
         snapshot, counts = self._mapper.snapshot(), self._mapper.counts()

@@ -42,6 +42,10 @@ class LogFile:
     def num_bytes(self) -> int:
         return self._file.tell()
 
+    @property
+    def num_channels(self) -> int:
+        return len(self._channels)
+
     def add(self, envelope: Envelope, log_time_ns: int) -> None:
         """Take one message; its bytes are not looked into."""
         self._writer.add_message(

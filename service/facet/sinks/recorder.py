@@ -16,6 +16,8 @@ from facet.sinks.log_file import LogFile
 from facet_protocol.codec import Message
 from facet_protocol.messages import Envelope
 
+MAX_CHANNELS = 10_000  # of MCAP's 65,535: every start of a publisher takes one
+
 
 class Recorder:
     """Writes envelopes to a folder of MCAP files. One thread at a time may use it.
@@ -121,7 +123,8 @@ class Recorder:
         if log is None:
             return
         age_ns = self._clock() - self._born_ns
-        if log.num_bytes >= self._max_file_bytes or age_ns >= self._max_file_ns:
+        is_full = log.num_bytes >= self._max_file_bytes or log.num_channels >= MAX_CHANNELS
+        if is_full or age_ns >= self._max_file_ns:
             self.roll()
 
     def free_bytes(self) -> int:
