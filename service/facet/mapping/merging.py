@@ -35,8 +35,10 @@ class Limits(NamedTuple):
     edge_cos: float  # of the nodes at the ends of an edge
     cos: float
     offset: float
+    cross: float  # offset between planes that do not touch
     variance: float
-    bridge_cos: float
+    bridge: float  # angle that a merged normal may leave its members' own, radians
+    tilt: float  # and what noise adds to that angle: this, over the width
 
 
 def limits(settings: MapSettings, sigma: float, angle_deg: float | None = None) -> Limits:
@@ -46,27 +48,30 @@ def limits(settings: MapSettings, sigma: float, angle_deg: float | None = None) 
         edge_cos=math.cos(math.radians(settings.edge_angle_deg)),
         cos=math.cos(math.radians(angle_deg or settings.merge_angle_deg)),
         offset=offset,
+        cross=min(settings.cross_sigmas * sigma, offset),
         variance=(settings.max_merged_sigma_m / settings.voxel_m) ** 2,
-        bridge_cos=math.cos(math.radians(settings.bridge_angle_deg)),
+        bridge=math.radians(settings.bridge_angle_deg),
+        tilt=settings.tilt_offset,
     )
 
 
 @njit(cache=True, nogil=True)
 def plane_of(votes, scatter, unit):  # type: ignore[no-untyped-def]
-    """(nx, ny, nz, variance along it) of a node: the fit, or the mean normal of a small one."""
+    """(nx, ny, nz, variance along it, variance across it) of a node: the fit, or the mean normal of
+    a small one. Across: the smaller of the two principal variances in the plane."""
     length = np.sqrt(unit[0] * unit[0] + unit[1] * unit[1] + unit[2] * unit[2])
     nx, ny, nz = unit[0] / length, unit[1] / length, unit[2] / length
     if votes >= TRUSTED:
-        total, fx, fy, fz, _, _ = smallest(scatter)
+        total, fx, fy, fz, across, _ = smallest(scatter)
         dot = fx * nx + fy * ny + fz * nz
         if dot < 0.0:
             fx, fy, fz = -fx, -fy, -fz
-        return fx, fy, fz, max(0.0, total) / votes
+        return fx, fy, fz, max(0.0, total) / votes, across / votes
     spread = (
         scatter[0] * nx * nx + scatter[3] * ny * ny + scatter[5] * nz * nz
         + 2.0 * (scatter[1] * nx * ny + scatter[2] * nx * nz + scatter[4] * ny * nz)
     )  # fmt: skip
-    return nx, ny, nz, max(0.0, spread) / votes
+    return nx, ny, nz, max(0.0, spread) / votes, 0.0
 
 
 @njit(cache=True, nogil=True)
@@ -110,7 +115,7 @@ def edge_costs(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-unt
     """(E,) cost of merging along each edge; inf where its two ends disagree by themselves."""
     normals = np.empty((votes.shape[0], 3))
     for t in range(votes.shape[0]):
-        nx, ny, nz, _ = plane_of(votes[t], scatter[t], unit[t])
+        nx, ny, nz, _, _ = plane_of(votes[t], scatter[t], unit[t])
         normals[t, 0], normals[t, 1], normals[t, 2] = nx, ny, nz
     costs = np.empty(edges.shape[0])
     for e in range(edges.shape[0]):
@@ -152,11 +157,20 @@ def _try(votes, mean, scatter, unit, normals, a, b, limit, m, s, u):  # type: ig
         return False
     total = pool(votes[a], mean[a], scatter[a], votes[b], mean[b], sb, m, s)
     u[0], u[1], u[2] = unit[a, 0] + unit[b, 0], unit[a, 1] + unit[b, 1], unit[a, 2] + unit[b, 2]
-    nx, ny, nz, variance = plane_of(total, s, u)
+    nx, ny, nz, variance, across = plane_of(total, s, u)
     if variance > limit.variance:
         return False
-    length = np.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
-    return (nx * u[0] + ny * u[1] + nz * u[2]) >= limit.bridge_cos * length
+    # a bridge: the merged normal leaves its members' own by more than noise tilts a thing so wide
+    noise = limit.tilt / np.sqrt(across) if across > 0.0 else 1.0
+    allowed = np.cos(min(1.5, limit.bridge + np.arctan(noise)))
+    return _agreement(nx, ny, nz, u) >= allowed
+
+
+@njit(cache=True, nogil=True)
+def _agreement(nx, ny, nz, unit):  # type: ignore[no-untyped-def]
+    """Cosine between a normal and the mean of the members' normals."""
+    length = np.sqrt(unit[0] * unit[0] + unit[1] * unit[1] + unit[2] * unit[2])
+    return (nx * unit[0] + ny * unit[1] + nz * unit[2]) / length
 
 
 @njit(cache=True, nogil=True)
@@ -168,7 +182,7 @@ def merge(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-
     version = np.zeros(count, np.int64)
     normals = np.empty((count, 3))
     for t in range(count):
-        nx, ny, nz, _ = plane_of(votes[t], scatter[t], unit[t])
+        nx, ny, nz, _, _ = plane_of(votes[t], scatter[t], unit[t])
         normals[t, 0], normals[t, 1], normals[t, 2] = nx, ny, nz
     m, s, u = np.zeros(3), np.zeros(6), np.zeros(3)
     tried = np.full((edges.shape[0], 2), -1, np.int64)
@@ -188,7 +202,7 @@ def merge(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-
             parent[drop] = keep
             votes[keep] = votes[a] + votes[b]
             mean[keep], scatter[keep], unit[keep] = m, s, u
-            nx, ny, nz, _ = plane_of(votes[keep], s, u)
+            nx, ny, nz, _, _ = plane_of(votes[keep], s, u)
             normals[keep, 0], normals[keep, 1], normals[keep, 2] = nx, ny, nz
             version[keep] = version[a] + version[b] + 1
     for t in range(count):

@@ -33,6 +33,7 @@ class Normals(NamedTuple):
     unit: NDArray[np.int16]  # (V, 3) normal towards the sensor, times UNIT
     kind: NDArray[np.uint8]  # EMPTY .. MIXED
     thickness: NDArray[np.uint8]  # thickness angle gamma (eq. 9), half degrees
+    border: NDArray[np.bool_]  # at a border of its surface, where points of others mix in
     reach: NDArray[np.uint8]  # largest radius that was looked at, voxels
 
 
@@ -47,6 +48,11 @@ class Rule(NamedTuple):
     tan_theta: float
     epsilon: float
     offset: float  # 1/8 voxels, of a voxel from the plane of its own region
+    border: float  # 1/8 voxels per voxel of radius, in the plane, from the centroid of the region
+    slab: float  # 1/8 voxels, half width of the slab that votes in the second look
+    passes: int
+    shrink: int
+    least_first: int
     start: int
     largest: int
     sparse: int
@@ -70,7 +76,12 @@ def make_rule(settings: MapSettings) -> Rule:
         floor2=(settings.sigma_floor * STEPS) ** 2,
         tan_theta=math.tan(math.radians(settings.theta_deg)),
         epsilon=settings.epsilon,
-        offset=settings.patch_offset * STEPS,
+        offset=settings.own_offset * STEPS,
+        border=settings.border * STEPS,
+        slab=settings.slab * STEPS,
+        passes=settings.passes,
+        shrink=settings.shrink,
+        least_first=settings.least_first,
         start=settings.start_radius,
         largest=settings.max_radius,
         sparse=MIN_VOTES,
@@ -78,7 +89,7 @@ def make_rule(settings: MapSettings) -> Rule:
 
 
 @njit(cache=True, nogil=True)
-def _gather(blocks, observable, block, local, r, ax, ay, az, least, sums):  # type: ignore[no-untyped-def]
+def _gather(blocks, observable, block, local, r, ax, ay, az, least, own, slab, sums):  # type: ignore[no-untyped-def]
     """Sum the votes of a region into sums: votes, weight, w x, y, z, w xx, xy, xz, yy, yz, zz,
     pose (0 unknown, -1 many). A voxel votes if its view direction times (ax, ay, az) is over
     `least` times the length of both, the length of (ax, ay, az) counted into `least`."""
@@ -125,6 +136,8 @@ def _gather(blocks, observable, block, local, r, ax, ay, az, least, sums):  # ty
                         cx = 8 * ((bit & 7) + 8 * di - x) + (seen & 15)
                         cy = 8 * ((bit >> 3) + 8 * dj - y) + ((seen >> 4) & 15)
                         cz = 8 * (oz + 8 * dk - z) + ((seen >> 8) & 15)
+                        if abs(ax * cx + ay * cy + az * cz - own) > slab:
+                            continue
                         sums[0] += 1
                         sums[1] += w
                         wx, wy, wz = w * cx, w * cy, w * cz
@@ -188,12 +201,12 @@ def _step(sums, r, rule):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def _estimate(blocks, observable, block, local, rule, sums):  # type: ignore[no-untyped-def]
-    """(class, nx, ny, nz, gamma in half degrees, reach) of one voxel."""
+    """(class, nx, ny, nz, gamma in half degrees, at a border, reach) of one voxel."""
     seen = observable[blocks.rows[block, local]]
     if seen == 0:
-        return EMPTY, 0, 0, 0, 0, 0
+        return EMPTY, 0, 0, 0, 0, False, 0
     if (seen >> 31) & 1:
-        return MIXED, 0, 0, 0, 0, 0
+        return MIXED, 0, 0, 0, 0, False, 0
     vx = float(((seen >> 16) & 31) - 8)
     vy = float(((seen >> 21) & 31) - 8)
     vz = float(((seen >> 26) & 31) - 8)
@@ -202,7 +215,7 @@ def _estimate(blocks, observable, block, local, rule, sums):  # type: ignore[no-
     reach = r
     visited = np.int64(0)
     while True:
-        _gather(blocks, observable, block, local, r, vx, vy, vz, least, sums)
+        _gather(blocks, observable, block, local, r, vx, vy, vz, least, 0.0, np.inf, sums)
         visited |= np.int64(1) << r
         r_next = _step(sums, r, rule)
         if r_next == r or (visited >> r_next) & 1:
@@ -211,15 +224,29 @@ def _estimate(blocks, observable, block, local, rule, sums):  # type: ignore[no-
         reach = max(reach, r)
     if r_next < r:  # the smallest radius of the cycle
         r = r_next
-        _gather(blocks, observable, block, local, r, vx, vy, vz, least, sums)
+        _gather(blocks, observable, block, local, r, vx, vy, vz, least, 0.0, np.inf, sums)
     if sums[0] < rule.sparse:
-        return SPARSE, 0, 0, 0, 0, reach
+        return SPARSE, 0, 0, 0, 0, False, reach
     kind, nx, ny, nz, tan_gamma = _classify(sums, seen, rule)
-    if kind == VALID or kind == THICK:  # once more, the side judged by the normal
-        _gather(blocks, observable, block, local, r, nx, ny, nz, 0.0, sums)
-        if sums[0] < rule.sparse:
-            return SPARSE, 0, 0, 0, 0, reach
-        kind, nx, ny, nz, tan_gamma = _classify(sums, seen, rule)
+    if kind == THICK and tan_gamma <= rule.tan_theta:  # beside a plane, not on it: a noise shell
+        return kind, 0, 0, 0, 255, False, reach
+    cx, cy, cz = seen & 15, (seen >> 4) & 15, (seen >> 8) & 15
+    first = r  # the region that gives the first normal: smaller where the full one is thick
+    while kind != ALIGNED:
+        for _ in range(rule.passes):  # look again: its own side, by the normal, and its own slab
+            own = nx * cx + ny * cy + nz * cz
+            _gather(blocks, observable, block, local, r, nx, ny, nz, 0.0, own, rule.slab, sums)
+            if sums[0] < rule.sparse:
+                return SPARSE, 0, 0, 0, 0, False, reach
+            kind, nx, ny, nz, tan_gamma = _classify(sums, seen, rule)
+        first -= 1
+        if kind == VALID or first < max(1, r - rule.shrink):
+            break
+        _gather(blocks, observable, block, local, first, vx, vy, vz, least, 0.0, np.inf, sums)
+        if sums[0] < rule.least_first:
+            break
+        _, nx, ny, nz, _ = _classify(sums, seen, rule)
+        kind = THICK
     half_degrees = np.int64(np.floor(np.arctan(tan_gamma) * 114.59155902616465 + 0.5))
     return (
         kind,
@@ -227,8 +254,20 @@ def _estimate(blocks, observable, block, local, rule, sums):  # type: ignore[no-
         np.int64(np.floor(ny * UNIT + 0.5)),
         np.int64(np.floor(nz * UNIT + 0.5)),
         half_degrees,
+        _at_border(sums, seen, r, nx, ny, nz, rule),
         reach,
     )
+
+
+@njit(cache=True, nogil=True)
+def _at_border(sums, seen, r, nx, ny, nz, rule):  # type: ignore[no-untyped-def]
+    """Whether the votes lie to one side of the voxel, in the plane."""
+    w = float(sums[1])
+    dx = sums[2] / w - (seen & 15)
+    dy = sums[3] / w - ((seen >> 4) & 15)
+    dz = sums[4] / w - ((seen >> 8) & 15)
+    along = nx * dx + ny * dy + nz * dz
+    return (dx * dx + dy * dy + dz * dz) - along * along > (rule.border * r) ** 2
 
 
 @njit(cache=True, nogil=True)
@@ -256,19 +295,21 @@ def _estimate_rows(blocks, columns, normals, rows, rule, changed):  # type: igno
     sums = np.zeros(12, np.int64)
     for s in range(rows.shape[0]):
         row = rows[s]
-        kind, nx, ny, nz, gamma, reach = _estimate(
+        kind, nx, ny, nz, gamma, border, reach = _estimate(
             blocks, columns.observable, columns.block[row], columns.local[row], rule, sums
         )
         unit = normals.unit[row]
         changed[s] = (
             normals.kind[row] != kind
             or normals.thickness[row] != gamma
+            or normals.border[row] != border
             or unit[0] != nx
             or unit[1] != ny
             or unit[2] != nz
         )
         normals.kind[row] = kind
         normals.thickness[row] = gamma
+        normals.border[row] = border
         normals.reach[row] = reach
         unit[0], unit[1], unit[2] = nx, ny, nz
 
@@ -380,6 +421,7 @@ class NormalField:
             np.zeros((0, 3), np.int16),
             np.zeros(0, np.uint8),
             np.zeros(0, np.uint8),
+            np.zeros(0, np.bool_),
             np.zeros(0, np.uint8),
         )
         self._flags = np.zeros(0, np.bool_)

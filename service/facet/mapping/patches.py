@@ -25,6 +25,7 @@ RUNGS = 40
 RUNG_STEP = 1.2  # a rung of sigma_N is 20 % wide
 FIRST_RUNG = 0.02 * 1024  # ticks: the lowest rung ends here (1 mm at 5 cm voxels)
 LEFTOVER_REACH = 8  # voxels between a leftover and the box of the patch it joins
+PURE_SHARE = 4  # one point in so many must lie off the corners for them alone to be fitted
 CORNER_COS = 0.8  # planes that share a corner voxel differ by more than 37 degrees
 
 
@@ -202,83 +203,108 @@ def _group_blocks(blocks, observable, normals, patches, which, grouping, changed
 
 
 @njit(cache=True, nogil=True)
-def _distance(patches, block, p, c, v, mixed):  # type: ignore[no-untyped-def]
-    """(distance to the patch's plane, gap to its box), eighths, of a leftover at c (eighths, from
-    that block's corner) seen from v; (1e9, 0) where the patch faces away or is out of reach."""
-    ux, uy, uz = patches.unit[block, p]
-    if not mixed and ux * v[0] + uy * v[1] + uz * v[2] <= 0:
-        return 1e9, 0
-    gap = 0
-    for a in range(3):
-        low = 8 * np.int64(patches.box[block, p, a])
-        high = 8 * np.int64(patches.box[block, p, a + 3]) + 8
-        gap = max(gap, low - c[a], c[a] - high)
-    if gap > 8 * LEFTOVER_REACH:
-        return 1e9, 0
-    votes = float(patches.votes[block, p])
-    w = (
-        ux * (c[0] - patches.centroid[block, p, 0] / votes)
-        + uy * (c[1] - patches.centroid[block, p, 1] / votes)
-        + uz * (c[2] - patches.centroid[block, p, 2] / votes)
-    ) / np.sqrt(float(ux) * ux + float(uy) * uy + float(uz) * uz)
-    return abs(w), gap
-
-
-@njit(cache=True, nogil=True)
-def _nearest(blocks, patches, block, local, seen, grouping, avoid):  # type: ignore[no-untyped-def]
-    """(label, block, index) of the best patch for a leftover, none of them within 37 degrees of
-    the direction `avoid` (unless that is zero); label -1: none."""
-    c = np.empty(3, np.int64)
-    v = np.empty(3, np.int64)
-    for a in range(3):
-        v[a] = ((seen >> (16 + 5 * a)) & 31) - 8
-    mixed = ((seen >> 31) & 1) == 1
-    avoid_norm = np.sqrt(avoid[0] ** 2 + avoid[1] ** 2 + avoid[2] ** 2)
-    best, best_cost, best_block, best_p = -1, 1e9, -1, -1
+def _candidates(blocks, patches, block, codes, planes, boxes):  # type: ignore[no-untyped-def]
+    """Patches of a block and its 26 neighbours: label, plane (unit normal, offset, weight of its
+    size) and box, in eighths from the block's own corner. Returns how many."""
+    count = 0
     for n in range(27):
         other = block if n == CENTRE else blocks.neighbours[block, n]
         if other < 0:
             continue
-        c[0] = 8 * ((local & 7) - 8 * (n % 3 - 1)) + (seen & 15)
-        c[1] = 8 * (((local >> 3) & 7) - 8 * ((n // 3) % 3 - 1)) + ((seen >> 4) & 15)
-        c[2] = 8 * ((local >> 6) - 8 * (n // 9 - 1)) + ((seen >> 8) & 15)
+        shift = (64 * (n % 3 - 1), 64 * ((n // 3) % 3 - 1), 64 * (n // 9 - 1))
         for p in range(patches.count[other]):
-            w, gap = _distance(patches, other, p, c, v, mixed)
-            if w > grouping.leftover:
+            if count == codes.shape[0]:
+                return count
+            unit, votes = patches.unit[other, p], float(patches.votes[other, p])
+            ux, uy, uz = float(unit[0]), float(unit[1]), float(unit[2])
+            length = np.sqrt(ux * ux + uy * uy + uz * uz)
+            offset = 0.0
+            for a in range(3):
+                planes[count, a] = unit[a] / length
+                middle = patches.centroid[other, p, a] / votes + shift[a]
+                offset += planes[count, a] * middle
+                boxes[count, a] = 8 * np.int64(patches.box[other, p, a]) + shift[a]
+                boxes[count, a + 3] = 8 * np.int64(patches.box[other, p, a + 3]) + 8 + shift[a]
+            planes[count, 3] = offset
+            planes[count, 4] = 1.0 / (1.0 + votes)
+            codes[count] = 16 * n + p
+            count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _nearest(planes, boxes, count, local, seen, tolerance, avoid):  # type: ignore[no-untyped-def]
+    """Candidate that suits a voxel best, none within 37 degrees of candidate `avoid`; -1: none.
+    It must face the voxel's sensor, its plane must be near, and so must its box."""
+    c0 = 8 * (local & 7) + (seen & 15)
+    c1 = 8 * ((local >> 3) & 7) + ((seen >> 4) & 15)
+    c2 = 8 * (local >> 6) + ((seen >> 8) & 15)
+    v0, v1, v2 = ((seen >> 16) & 31) - 8, ((seen >> 21) & 31) - 8, ((seen >> 26) & 31) - 8
+    mixed = ((seen >> 31) & 1) == 1
+    best, best_cost = -1, np.inf
+    for q in range(count):
+        u = planes[q]
+        w = abs(u[0] * c0 + u[1] * c1 + u[2] * c2 - u[3])
+        if w > tolerance or (not mixed and u[0] * v0 + u[1] * v1 + u[2] * v2 <= 0.0):
+            continue
+        if avoid >= 0:
+            o = planes[avoid]
+            if u[0] * o[0] + u[1] * o[1] + u[2] * o[2] > CORNER_COS:
                 continue
-            if avoid_norm > 0.0:
-                ux, uy, uz = patches.unit[other, p]
-                norm = avoid_norm * np.sqrt(float(ux) * ux + float(uy) * uy + float(uz) * uz)
-                if ux * avoid[0] + uy * avoid[1] + uz * avoid[2] > CORNER_COS * norm:
-                    continue
-            cost = (w / grouping.leftover) ** 2 + (max(gap, 0) / (8.0 * LEFTOVER_REACH)) ** 2
-            cost += 1.0 / (1.0 + patches.votes[other, p])
-            if cost < best_cost:
-                best, best_cost, best_block, best_p = 16 * n + p, cost, other, p
-    return best, best_block, best_p
+        box = boxes[q]
+        gap = max(0, box[0] - c0, c0 - box[3], box[1] - c1, c1 - box[4], box[2] - c2, c2 - box[5])
+        if gap > 8 * LEFTOVER_REACH:
+            continue
+        cost = (w / tolerance) ** 2 + (gap / (8.0 * LEFTOVER_REACH)) ** 2 + u[4]
+        if cost < best_cost:
+            best, best_cost = q, cost
+    return best
+
+
+@njit(cache=True, nogil=True)
+def _flat(planes, count):  # type: ignore[no-untyped-def]
+    """Whether all candidates look the same way: then there is no corner."""
+    for q in range(1, count):
+        if (
+            planes[q, 0] * planes[0, 0] + planes[q, 1] * planes[0, 1] + planes[q, 2] * planes[0, 2]
+            < 0.98
+        ):
+            return False
+    return True
 
 
 @njit(cache=True, nogil=True)
 def _label_blocks(blocks, observable, patches, which, grouping, changed):  # type: ignore[no-untyped-def]
     """Label every voxel of the blocks `which` again; mark the blocks where a label changed."""
-    avoid = np.zeros(3)
+    most = 27 * PER_BLOCK
+    codes = np.empty(most, np.int16)
+    planes = np.empty((most, 5))
+    boxes = np.empty((most, 6), np.int64)
     for q in range(which.shape[0]):
         block = which[q]
+        count = _candidates(blocks, patches, block, codes, planes, boxes)
+        flat = _flat(planes, count)
         for local in range(512):
             row = blocks.rows[block, local]
             if row < 0:
                 continue
             seen = observable[row]
             label, second = -1, -1
-            if patches.member[row] >= 0:
-                label = 16 * CENTRE + patches.member[row]
-            elif seen != 0:
-                avoid[:] = 0.0
-                label, b, p = _nearest(blocks, patches, block, local, seen, grouping, avoid)
-                if label >= 0:
-                    for a in range(3):
-                        avoid[a] = patches.unit[b, p, a]
-                    second, b, p = _nearest(blocks, patches, block, local, seen, grouping, avoid)
+            if seen != 0:
+                own = -1
+                if patches.member[row] >= 0:
+                    label = 16 * CENTRE + patches.member[row]
+                    for o in range(count):
+                        if codes[o] == label:
+                            own = o
+                else:
+                    own = _nearest(planes, boxes, count, local, seen, grouping.leftover, -1)
+                    if own >= 0:
+                        label = codes[own]
+                if own >= 0 and not flat:
+                    other = _nearest(planes, boxes, count, local, seen, grouping.leftover, own)
+                    if other >= 0:
+                        second = codes[other]
             if patches.label[row] != label or patches.second[row] != second:
                 patches.label[row] = label
                 patches.second[row] = second
@@ -286,33 +312,55 @@ def _label_blocks(blocks, observable, patches, which, grouping, changed):  # typ
 
 
 @njit(cache=True, nogil=True)
-def _sum_points(blocks, moments, patches, which, rungs, histogram):  # type: ignore[no-untyped-def]
-    """Exact moments of the members' points about the block corner, and the rung of sigma_N."""
-    m = np.zeros((PER_BLOCK, MOMENTS), np.int64)
-    spread = np.zeros(6)
+def _add_points(blocks, moments, border, patches, block, pure, m):  # type: ignore[no-untyped-def]
+    """Sum the members' point moments about the block corner into m (PER_BLOCK, 10): of all, or
+    only of `pure` ones: not at a border, and claimed by no plane at an angle."""
+    m[:] = 0
+    for z in range(8):
+        word = blocks.occupied[block, z]
+        while word != np.uint64(0):
+            bit = np.int64(trailing_zeros(word))
+            word &= word - np.uint64(1)
+            row = blocks.rows[block, 64 * z + bit]
+            p = patches.member[row]
+            if p < 0 or (pure and (border[row] or patches.second[row] >= 0)):
+                continue
+            own = moments[row]
+            n = own[0]
+            d = (TICKS * (bit & 7), TICKS * (bit >> 3), TICKS * z)
+            s = 4
+            for a in range(3):
+                for b in range(a, 3):
+                    m[p, s] += own[s] + d[a] * own[1 + b] + d[b] * own[1 + a] + n * d[a] * d[b]
+                    s += 1
+            for a in range(3):
+                m[p, 1 + a] += own[1 + a] + n * d[a]
+            m[p, 0] += n
+
+
+@njit(cache=True, nogil=True)
+def _variance(m):  # type: ignore[no-untyped-def]
+    """Smallest principal variance of point moments."""
+    spread = np.empty(6)
+    n = float(m[0])
+    s = 0
+    for a in range(3):
+        for b in range(a, 3):
+            spread[s] = m[4 + s] / n - (m[1 + a] / n) * (m[1 + b] / n)
+            s += 1
+    return smallest(spread)[0]
+
+
+@njit(cache=True, nogil=True)
+def _sum_points(blocks, moments, border, patches, which, rungs, histogram):  # type: ignore[no-untyped-def]
+    """Point moments and the rung of sigma_N. Corner voxels hold points of two planes: they are
+    left out where enough others are there."""
+    whole = np.zeros((PER_BLOCK, MOMENTS), np.int64)
+    pure = np.zeros((PER_BLOCK, MOMENTS), np.int64)
     for q in range(which.shape[0]):
         block = which[q]
-        m[:] = 0
-        for z in range(8):
-            word = blocks.occupied[block, z]
-            while word != np.uint64(0):
-                bit = np.int64(trailing_zeros(word))
-                word &= word - np.uint64(1)
-                row = blocks.rows[block, 64 * z + bit]
-                p = patches.member[row]
-                if p < 0:
-                    continue
-                own = moments[row]
-                n = own[0]
-                d = (TICKS * (bit & 7), TICKS * (bit >> 3), TICKS * z)
-                s = 4
-                for a in range(3):
-                    for b in range(a, 3):
-                        m[p, s] += own[s] + d[a] * own[1 + b] + d[b] * own[1 + a] + n * d[a] * d[b]
-                        s += 1
-                for a in range(3):
-                    m[p, 1 + a] += own[1 + a] + n * d[a]
-                m[p, 0] += n
+        _add_points(blocks, moments, border, patches, block, False, whole)
+        _add_points(blocks, moments, border, patches, block, True, pure)
         for p in range(PER_BLOCK):
             votes = patches.counted[block, p]
             if votes > 0:
@@ -320,14 +368,9 @@ def _sum_points(blocks, moments, patches, which, rungs, histogram):  # type: ign
             patches.counted[block, p] = 0
             if p >= patches.count[block]:
                 continue
-            patches.points[block, p] = m[p]
-            n = float(m[p, 0])
-            s = 0
-            for a in range(3):
-                for b in range(a, 3):
-                    spread[s] = m[p, 4 + s] / n - (m[p, 1 + a] / n) * (m[p, 1 + b] / n)
-                    s += 1
-            variance = smallest(spread)[0]
+            enough = PURE_SHARE * pure[p, 0] >= whole[p, 0]
+            patches.points[block, p] = pure[p] if enough else whole[p]
+            variance = _variance(patches.points[block, p])
             rung = 0
             while rung < RUNGS - 1 and variance > rungs[rung]:
                 rung += 1
@@ -393,11 +436,13 @@ class PatchField:
         _label_blocks(
             store.blocks, store.columns.observable, self.patches, near, self._grouping, relabelled
         )
-        touched = np.union1d(block_of[touched_rows], regrouped)
+        relabelled_blocks = near[relabelled]
+        touched = np.union1d(block_of[touched_rows], np.union1d(dirty, relabelled_blocks))
         _sum_points(
-            store.blocks, store.columns.moments, self.patches, touched, self.rungs, self.histogram
+            store.blocks, store.columns.moments, normals.border, self.patches, touched, self.rungs,
+            self.histogram,
         )
-        return regrouped, near[relabelled], touched
+        return regrouped, relabelled_blocks, touched
 
     def sigma(self) -> float:
         """Noise of the scene, ticks: the median over member voxels of their patch's rung."""

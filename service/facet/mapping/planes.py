@@ -100,7 +100,7 @@ def group_planes(table: Table, limit: Limits, settings: MapSettings) -> PlaneSet
     label, nodes = _drop(label, nodes, keep)
 
     every = np.argwhere(np.triu(np.ones((len(nodes.votes),) * 2, np.bool_), 1)).astype(np.int64)
-    tight = limit._replace(edge_cos=limit.bridge_cos)
+    tight = limit._replace(edge_cos=float(np.cos(limit.bridge)), offset=limit.cross)
     roots, merged = merge_nodes(nodes, every, tight)
     into, nodes = _relabel(roots, merged)
     label = np.where(label == FREE, FREE, into[label]) if len(into) else label

@@ -18,7 +18,7 @@ class MapSettings:
     """Settings of one map. Lengths without `_m` are in voxels; angles in degrees at this door only."""
 
     voxel_m: float = 0.05
-    theta_deg: float = 20.0  # thickness angle above which a normal is refused (paper: 9 to 15)
+    theta_deg: float = 15.0  # thickness angle above which a normal is refused (paper: 9 to 15)
     detail_level: float = 0.98  # share of the occupied voxels that the kept planes must hold
 
     # scans
@@ -38,6 +38,12 @@ class MapSettings:
     start_radius: int = 3
     max_radius: int = 20
     sigma_floor: float = 0.2
+    own_offset: float = 0.4  # of a voxel from the plane of its own region
+    border: float = 0.35  # in-plane offset from its region's centroid, radii, at a border
+    slab: float = 1.0
+    passes: int = 2
+    shrink: int = 2
+    least_first: int = 6
     # patches and their leftovers
     patch_angle_deg: float = 15.0
     patch_offset: float = 0.5
@@ -46,6 +52,8 @@ class MapSettings:
     edge_angle_deg: float = 15.0
     merge_angle_deg: float = 10.0
     bridge_angle_deg: float = 4.0  # phi_c: merged normal against the members' own
+    tilt_offset: float = 0.25
+    cross_sigmas: float = 1.0  # between planes that do not touch
     merge_sigmas: float = 3.0
     max_merged_sigma_m: float = 0.025
     min_area_m2: float = 0.25  # n_occ is never above this many square metres of voxels
