@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import rerun.blueprint as rrb
 
 from facet.export.viewpoint import corners, is_overhead, view_rotation
