@@ -286,6 +286,7 @@ def test_run_play_stop_replay(log: Path, tmp_path: Path) -> None:
         assert "played 6 scans" in played.stdout
         status = process("status", "--connect", service.endpoint)
         assert status.returncode == 0, status.stderr
+        assert "[r1/lidar]" in status.stdout
         code, output = service.stop()
     finally:
         service.process.kill()

@@ -116,7 +116,7 @@ def _connected(
 
     deadline = time.monotonic() + READY_S
     if err.is_terminal:
-        err.print("starting the service; the first time it is compiled, which takes a minute")
+        err.print("starting the service; the first time it is compiled, for half a minute")
     while running.poll() is None and time.monotonic() < deadline:
         try:
             with open_session(client_settings(endpoint)) as session:

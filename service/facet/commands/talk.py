@@ -5,12 +5,14 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterator
+from itertools import zip_longest
 from typing import Annotated
 
 import typer
 import zenoh
 from rich.live import Live
 from rich.table import Table
+from rich.text import Text
 
 from facet.commands.terminal import Exit, InputError, err, out
 from facet.session import DEFAULT_ENDPOINT, client_settings, open_session
@@ -112,8 +114,6 @@ def _table(current: Status) -> Table:
         [(name, f"{value:,.3g}") for name, value in current.gauges.items()],
         [(name, f"{value:.1f}") for name, value in current.stage_ms.items()],
     ]
-    for k in range(max(map(len, columns))):
-        grid.add_row(
-            *(cell for rows in columns for cell in (rows[k] if k < len(rows) else ("", "")))
-        )
+    for cells in zip_longest(*columns, fillvalue=("", "")):
+        grid.add_row(*(Text(text) for cell in cells for text in cell))  # no markup in names
     return grid
