@@ -69,9 +69,6 @@ class SequenceLedger:
         is_new = numbers.add(sequence)
         return is_new, max(0, sequence - last - 1) if last else 0
 
-    def knows(self, source: str, epoch: int, sequence: int) -> bool:
-        return sequence in self._seen[source].get(epoch, ())
-
     def missing(self) -> dict[str, int]:
         """Numbers that have not come, by source; a late arrival takes one away again."""
         return {

@@ -16,7 +16,6 @@ from facet.commands.terminal import InputError, existing, megabytes, out, progre
 from facet.sinks.log_file import write_recording
 from facet_protocol.messages import Envelope, Pose, Scan, ScanKind
 
-PERIOD_NS = 100_000_000  # of scans without stamps of their own
 NONE = np.zeros((0, 3), dtype=np.float32)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated
 
@@ -147,5 +147,6 @@ def parse_speed(text: str) -> float:
     return speed
 
 
-def _count(logs: list[Path], match: Callable[[Envelope], bool] = is_scan) -> int:
-    return sum(map(match, Recording(logs)))
+def _count(logs: list[Path]) -> int | None:
+    """For the progress bar; a pipe has none, and the logs are not read twice."""
+    return sum(map(is_scan, Recording(logs))) if err.is_terminal else None
