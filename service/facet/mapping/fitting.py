@@ -31,13 +31,13 @@ class Fit(NamedTuple):
 
 
 def fit_plane(
-    num_points: int,
+    weight: float,
     centroid: NDArray[np.float64],
     scatter: NDArray[np.float64],
     mean_normal: NDArray[np.float64],
     tick_m: float,
 ) -> Fit:
-    """Fit through points with `centroid` (3,) m and `scatter` (6,) m^2 about it.
+    """Fit through `weight` points with `centroid` (3,) m and `scatter` (6,) m^2 about it.
 
     `mean_normal` (3,), any length, tells the side it was seen from."""
     low, nx, ny, nz, middle, high = smallest(scatter)
@@ -45,7 +45,7 @@ def fit_plane(
     if float(inside @ mean_normal) < 0.0:
         inside = -inside
     offset = float((inside[0] * centroid[0] + inside[1] * centroid[1]) + inside[2] * centroid[2])
-    variances = np.maximum([high, middle, low], 0.0) / num_points
+    variances = np.maximum([high, middle, low], 0.0) / weight
     flipped = offset < -tick_m  # nearer to the origin than a tick the inside sign stays
     normal = -inside if flipped else inside
     tangential = math.sqrt(math.sqrt(max(variances[0] * variances[1], 1e-24)))
@@ -58,7 +58,7 @@ def fit_plane(
         facing=-1 if flipped else 1,
         sigma_n_m=sigma,
         thickness_angle_deg=math.degrees(math.atan(2.0 * sigma / (math.sqrt(3.0) * tangential))),
-        covariance=_covariance(num_points, normal, centroid, scatter, variances),
+        covariance=_covariance(weight, normal, centroid, scatter, variances),
         plane_class=_classify(inside),
     )
 
@@ -70,7 +70,7 @@ def _classify(inside: NDArray[np.float64]) -> PlaneClass:
 
 
 def _covariance(
-    num_points: int,
+    weight: float,
     normal: NDArray[np.float64],
     centroid: NDArray[np.float64],
     scatter: NDArray[np.float64],
@@ -78,10 +78,10 @@ def _covariance(
 ) -> NDArray[np.float64]:
     """Of (normal, d), first order: the normal tilts about the two principal directions in the plane
     with variance sigma_N^2 / (N sigma_i^2)."""
-    full = scatter[[0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(3, 3) / num_points
+    full = scatter[[0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(3, 3) / weight
     tangent = np.eye(3) - np.outer(normal, normal)
     spread = tangent @ full @ tangent
-    noise = variances[2] / num_points
+    noise = variances[2] / weight
     tilt = noise * np.linalg.pinv(spread, rcond=1e-9, hermitian=True)
     across = -tilt @ centroid  # d = normal . centroid: it moves against the tilt's lever arm
     covariance = np.empty((4, 4))

@@ -106,7 +106,7 @@ class Mapper:
         self._planes = group_planes(self._table, limit, self.settings)
         points = fit_points(self._table, self._planes, self.settings.voxel_m)
         done("planes")
-        lineage = self._identity.assign(len(points.num_points), self._heritage())
+        lineage = self._identity.assign(len(points.total), self._heritage())
         members, renamed = self._name(lineage.ids)
         figures = self._figures(lineage.ids, points, members)
         done("identity")
@@ -215,10 +215,12 @@ class Mapper:
         tick_m = self.settings.tick_m
         figures = {}
         for plane, plane_id in enumerate(ids.tolist()):
-            num, centroid = int(points.num_points[plane]), points.centroid[plane]
+            total, centroid = int(points.total[plane]), points.centroid[plane]
             unit = self._planes.nodes.unit[plane]
-            fit = fit_plane(num, centroid, points.scatter[plane], unit, tick_m)
+            fit = fit_plane(
+                float(points.weight[plane]), centroid, points.scatter[plane], unit, tick_m
+            )
             seen = self._witness.of({key for key, _ in members[plane_id]})
             voxels = int(self._planes.occupation[plane])
-            figures[plane_id] = Figures(fit, num, voxels, centroid, seen)
+            figures[plane_id] = Figures(fit, total, voxels, centroid, seen)
         return figures

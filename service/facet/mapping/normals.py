@@ -120,7 +120,7 @@ def _gather(blocks, observable, block, local, r, ax, ay, az, least, own, slab, s
                         bit = np.int64(trailing_zeros(word))
                         word &= word - np.uint64(1)
                         seen = observable[blocks.rows[other, 64 * oz + bit]]
-                        if (seen >> 31) & 1:
+                        if (seen >> 31) & 1 and -np.inf < least < 0.0:  # its side needs a normal
                             continue
                         vx = ((seen >> 16) & 31) - 8
                         vy = ((seen >> 21) & 31) - 8
@@ -205,12 +205,13 @@ def _estimate(blocks, observable, block, local, rule, sums):  # type: ignore[no-
     seen = observable[blocks.rows[block, local]]
     if seen == 0:
         return EMPTY, 0, 0, 0, 0, False, 0
-    if (seen >> 31) & 1:
-        return MIXED, 0, 0, 0, 0, False, 0
     vx = float(((seen >> 16) & 31) - 8)
     vy = float(((seen >> 21) & 31) - 8)
     vz = float(((seen >> 26) & 31) - 8)
     least = -0.5 * np.sqrt(vx * vx + vy * vy + vz * vz)  # cos 120 degrees
+    mixed = ((seen >> 31) & 1) == 1
+    if mixed:  # seen from opposite directions: any side may vote until a normal is known
+        least = -np.inf
     r = rule.start
     reach = r
     visited = np.int64(0)
@@ -247,6 +248,8 @@ def _estimate(blocks, observable, block, local, rule, sums):  # type: ignore[no-
             break
         _, nx, ny, nz, _ = _classify(sums, seen, rule)
         kind = THICK
+    if mixed and kind == VALID and nx * vx + ny * vy + nz * vz < 4.0:
+        kind = MIXED  # both sides of a thin thing, not one side from two directions
     half_degrees = np.int64(np.floor(np.arctan(tan_gamma) * 114.59155902616465 + 0.5))
     return (
         kind,

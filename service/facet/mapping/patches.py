@@ -25,7 +25,7 @@ RUNGS = 40
 RUNG_STEP = 1.2  # a rung of sigma_N is 20 % wide
 FIRST_RUNG = 0.02 * 1024  # ticks: the lowest rung ends here (1 mm at 5 cm voxels)
 LEFTOVER_REACH = 8  # voxels between a leftover and the box of the patch it joins
-PURE_SHARE = 4  # one point in so many must lie off the corners for them alone to be fitted
+PURE_SHARE = 4  # one point in so many must be pure for the rung to be read from these alone
 CORNER_COS = 0.8  # planes that share a corner voxel differ by more than 37 degrees
 
 
@@ -38,9 +38,9 @@ class Patches(NamedTuple):
     scatter: NDArray[np.int64]  # (.., 6) sum of their products xx, xy, xz, yy, yz, zz
     unit: NDArray[np.int32]  # (.., 3) sum of the members' normals, times UNIT
     box: NDArray[np.int8]  # (.., 6) least and largest local x, y, z of the members
-    points: NDArray[
-        np.int64
-    ]  # (.., 10) exact moments of the members' points, ticks from the corner
+    points: NDArray[np.int64]  # (.., 10) exact moments of the pure members' points, ticks from the
+    # block corner; pure: not at a border, and claimed by no plane at an angle
+    total: NDArray[np.int64]  # points of all members
     rung: NDArray[np.int8]  # of sigma_N
     counted: NDArray[np.int32]  # votes that stand in the histogram of rungs
     member: NDArray[np.int8]  # (V,) index of the patch that a valid voxel belongs to, -1: none
@@ -66,6 +66,7 @@ def empty_patches() -> Patches:
         unit=np.zeros((*shape, 3), np.int32),
         box=np.zeros((*shape, 6), np.int8),
         points=np.zeros((*shape, MOMENTS), np.int64),
+        total=np.zeros(shape, np.int64),
         rung=np.zeros(shape, np.int8),
         counted=np.zeros(shape, np.int32),
         member=np.zeros(0, np.int8),
@@ -368,9 +369,9 @@ def _sum_points(blocks, moments, border, patches, which, rungs, histogram):  # t
             patches.counted[block, p] = 0
             if p >= patches.count[block]:
                 continue
-            enough = PURE_SHARE * pure[p, 0] >= whole[p, 0]
-            patches.points[block, p] = pure[p] if enough else whole[p]
-            variance = _variance(patches.points[block, p])
+            patches.points[block, p] = pure[p]
+            patches.total[block, p] = whole[p, 0]
+            variance = _variance(pure[p] if PURE_SHARE * pure[p, 0] >= whole[p, 0] else whole[p])
             rung = 0
             while rung < RUNGS - 1 and variance > rungs[rung]:
                 rung += 1
@@ -439,7 +440,12 @@ class PatchField:
         relabelled_blocks = near[relabelled]
         touched = np.union1d(block_of[touched_rows], np.union1d(dirty, relabelled_blocks))
         _sum_points(
-            store.blocks, store.columns.moments, normals.border, self.patches, touched, self.rungs,
+            store.blocks,
+            store.columns.moments,
+            normals.border,
+            self.patches,
+            touched,
+            self.rungs,
             self.histogram,
         )
         return regrouped, relabelled_blocks, touched

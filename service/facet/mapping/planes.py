@@ -20,6 +20,7 @@ from facet.mapping.settings import TICKS, TILE, MapSettings
 from facet.mapping.tiles import Tile
 
 FREE = -1
+ENOUGH_POINTS = 200  # pure points that a plane is fitted to
 
 
 class Table(NamedTuple):
@@ -30,7 +31,8 @@ class Table(NamedTuple):
     nodes: Nodes  # (T, ...)
     occupation: NDArray[np.int64]  # (T,) voxels
     edges: NDArray[np.int64]  # (E, 2) adjacent nodes, ascending
-    points: NDArray[np.int64]  # (T, 10) exact point moments about the tile corner
+    points: NDArray[np.int64]  # (T, 10) exact moments of pure points about the tile corner
+    total: NDArray[np.int64]  # (T,) points of all members
     tile_of: NDArray[np.int64]  # (T,) index into tile_keys
 
 
@@ -67,9 +69,8 @@ def tabulate(tiles: dict[int, Tile]) -> Table:
     if not ordered:
         none = Nodes(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 6)), np.zeros((0, 3)))
         empty = np.zeros(0, np.int64)
-        return Table(
-            keys, starts, none, empty, empty.reshape(0, 2), np.zeros((0, 10), np.int64), empty
-        )
+        pairs, points = empty.reshape(0, 2), np.zeros((0, 10), np.int64)
+        return Table(keys, starts, none, empty, pairs, points, empty, empty)
     nodes = Nodes(*(np.concatenate(c) for c in zip(*(t.nodes for t in ordered), strict=True)))
     pairs = np.concatenate([t.pairs for t in ordered])
     own = np.repeat(starts[:-1], [len(t.pairs) for t in ordered]) + pairs[:, 0]
@@ -81,6 +82,7 @@ def tabulate(tiles: dict[int, Tile]) -> Table:
         np.concatenate([t.occupation for t in ordered]),
         np.stack([own, other], axis=1),
         np.concatenate([t.points for t in ordered]),
+        np.concatenate([t.total for t in ordered]),
         np.repeat(np.arange(len(ordered)), counts),
     )
 
@@ -95,6 +97,7 @@ def group_planes(table: Table, limit: Limits, settings: MapSettings) -> PlaneSet
     stages.average_sigma = _average_sigma(nodes)
 
     keep, least, stages.detail_reached = detail_level(occupation, settings)
+    keep &= nodes.votes >= settings.member_share * least  # leftovers alone make no plane
     stages.min_occupation = least
     stages.detailed = int(keep.sum())
     label, nodes = _drop(label, nodes, keep)
@@ -218,15 +221,16 @@ def _adopt(
 
 
 class PointFit(NamedTuple):
-    """Least-squares planes through the points, K of them. Metres, about the map's origin."""
+    """What planes are fitted to, K of them. Metres, about the map's origin."""
 
-    num_points: NDArray[np.int64]  # (K,)
+    total: NDArray[np.int64]  # (K,) points of all members
+    weight: NDArray[np.float64]  # (K,) pure points, or voxels where these are too few
     centroid: NDArray[np.float64]  # (K, 3)
     scatter: NDArray[np.float64]  # (K, 6)
 
 
 @njit(cache=True, nogil=True)
-def _pool_points(points, corners, label, core, count, num, mean, scatter):  # type: ignore[no-untyped-def]
+def _pool_points(points, corners, label, core, num, mean, scatter):  # type: ignore[no-untyped-def]
     m, s = np.zeros(3), np.zeros(6)
     own_mean, own = np.zeros(3), np.zeros(6)
     for t in range(points.shape[0]):
@@ -250,10 +254,17 @@ def _pool_points(points, corners, label, core, count, num, mean, scatter):  # ty
 
 
 def fit_points(table: Table, planes: PlaneSet, voxel_m: float) -> PointFit:
-    """Pool the exact point moments of each plane's core tile-planes, in canonical order."""
+    """Pool the exact point moments of each plane's core tile-planes, in canonical order.
+
+    A plane with hardly any pure points is fitted to its voxels' centroids instead."""
     count = len(planes.nodes.votes)
     num = np.zeros(count, np.int64)
     mean, scatter = np.zeros((count, 3)), np.zeros((count, 6))
     corners = (unpack_all(table.tile_keys) * float(TILE))[table.tile_of]
-    _pool_points(table.points, corners, planes.label, planes.core, count, num, mean, scatter)
-    return PointFit(num, mean * voxel_m, scatter * voxel_m**2)
+    _pool_points(table.points, corners, planes.label, planes.core, num, mean, scatter)
+    few = num < ENOUGH_POINTS
+    mean[few], scatter[few] = planes.nodes.mean[few], planes.nodes.scatter[few]
+    on = planes.label != FREE
+    total = np.bincount(planes.label[on], table.total[on], minlength=count).astype(np.int64)
+    weight = np.where(few, planes.nodes.votes, num)
+    return PointFit(total, weight, mean * voxel_m, scatter * voxel_m**2)

@@ -57,6 +57,7 @@ class MapSettings:
     merge_sigmas: float = 3.0
     max_merged_sigma_m: float = 0.025
     min_area_m2: float = 0.25  # n_occ is never above this many square metres of voxels
+    member_share: float = 0.5  # of n_occ, that must be voxels with a valid normal
     min_surface_m2: float = 0.05
     # free space
     passed_beams: int = 3

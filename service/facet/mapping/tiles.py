@@ -30,7 +30,8 @@ class Tile:
     key: int
     blocks: NDArray[np.int32]  # of the tile, by ascending block key
     nodes: Nodes  # (T, ...) voxels, about the map's origin
-    points: NDArray[np.int64]  # (T, 10) exact moments of the members' points about the tile corner
+    points: NDArray[np.int64]  # (T, 10) exact moments of the pure members' points, tile corner
+    total: NDArray[np.int64]  # (T,) points of all members
     occupation: NDArray[np.int64]  # (T,) voxels, leftovers included
     rows: NDArray[np.int32]  # (M,) voxel rows of its tile-planes
     owner: NDArray[np.int16]  # (M,) their tile-plane
@@ -108,8 +109,9 @@ def _tile_nodes(block_keys, neighbours, patches, which, tile_key):  # type: igno
 
 @njit(cache=True, nogil=True)
 def _gather_points(block_keys, patches, which, tile_key, plane_of_patch, count):  # type: ignore[no-untyped-def]
-    """(count, 10) exact point moments about the tile corner, ticks."""
+    """(count, 10) exact point moments about the tile corner, ticks, and (count,) all points."""
     out = np.zeros((count, MOMENTS), np.int64)
+    total = np.zeros(count, np.int64)
     ti, tj, tk = unpack(tile_key)
     for q in range(which.shape[0]):
         block = which[q]
@@ -118,6 +120,7 @@ def _gather_points(block_keys, patches, which, tile_key, plane_of_patch, count):
         d = (step * (i - 8 * ti), step * (j - 8 * tj), step * (k - 8 * tk))
         for p in range(patches.count[block]):
             m = out[plane_of_patch[block, p]]
+            total[plane_of_patch[block, p]] += patches.total[block, p]
             own = patches.points[block, p]
             n = own[0]
             s = 4
@@ -128,7 +131,7 @@ def _gather_points(block_keys, patches, which, tile_key, plane_of_patch, count):
             for a in range(3):
                 m[1 + a] += own[1 + a] + n * d[a]
             m[0] += n
-    return out
+    return out, total
 
 
 @njit(cache=True, nogil=True)
@@ -272,7 +275,7 @@ class TileField:
             self._grow(store, patches, key, limits)
         for key in np.unique(tile_keys_of(keys[summed])):
             tile = self.tiles[int(key)]
-            tile.points = _gather_points(
+            tile.points, tile.total = _gather_points(
                 keys, patches.patches, tile.blocks, tile.key, self.plane_of_patch, tile.num_planes
             )
         moved = np.unique(np.concatenate([regrouped, relabelled, dirty]))
@@ -332,7 +335,7 @@ class TileField:
         plane_of_patch = np.zeros((len(tile.blocks), PER_BLOCK), np.int16)
         plane_of_patch[where] = index
         self.plane_of_patch[tile.blocks] = plane_of_patch
-        tile.points = _gather_points(
+        tile.points, tile.total = _gather_points(
             store.blocks.keys, patches.patches, tile.blocks, key, self.plane_of_patch, len(kept)
         )
 
@@ -383,6 +386,6 @@ class TileField:
 def _empty_tile(key: int, blocks: NDArray[np.int32]) -> Tile:
     nodes = Nodes(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 6)), np.zeros((0, 3)))
     return Tile(
-        key, blocks, nodes, np.zeros((0, MOMENTS), np.int64), np.zeros(0, np.int64),
+        key, blocks, nodes, np.zeros((0, MOMENTS), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64),
         np.zeros(0, np.int32), np.zeros(0, np.int16), np.zeros(0, np.bool_),
     )  # fmt: skip
