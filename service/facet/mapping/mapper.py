@@ -16,6 +16,7 @@ from facet.mapping.digest import Digest, derived_digest, model_planes, state_dig
 from facet.mapping.fitting import fit_plane
 from facet.mapping.freespace import FreeSpace
 from facet.mapping.identity import Heritage, Identity
+from facet.mapping.invariants import check_invariants
 from facet.mapping.merging import limits
 from facet.mapping.normals import NormalField
 from facet.mapping.patches import PatchField
@@ -183,6 +184,10 @@ class Mapper:
             state_digest(self._store, self._free),
             derived_digest(planes, self.counts().as_dict()),
         )
+
+    def check_invariants(self) -> None:
+        """Raise AssertionError unless the map is what a map must be (style 7.5). Slow."""
+        check_invariants(self)
 
     def _heritage(self) -> Heritage:
         """Voxels that the planes of this update share with those of the last."""
