@@ -240,18 +240,16 @@ def crossings(ring: NDArray[np.int32]) -> NDArray[np.int64]:
     return np.concatenate(found)
 
 
-class _AllDirty:
-    """A store that says that everything changed: what is derived from it is derived anew."""
-
-    def __init__(self, store: VoxelStore) -> None:
-        self._store = store
-        self.touched_rows = store.occupied_rows()
-
-    def __getattr__(self, name: str) -> object:
-        return getattr(self._store, name)
-
-    def settle(self) -> NDArray[np.int32]:
-        return self.touched_rows
+def _unsettled(store: VoxelStore, anew: VoxelStore) -> None:
+    """Make `anew` hold the same integers, none of them looked at yet. Shares what nobody writes."""
+    rows = store.occupied_rows()
+    anew.blocks = store.blocks._replace(occupied=np.zeros_like(store.blocks.occupied))
+    anew.columns = store.columns._replace(
+        observable=np.zeros_like(store.columns.observable),
+        touched=np.zeros_like(store.columns.touched),
+    )
+    anew.num_blocks, anew.num_rows = store.num_blocks, store.num_rows
+    anew._touched_rows, anew._num_touched = rows, len(rows)
 
 
 def _check_digest(mapper: Mapper) -> None:
@@ -260,7 +258,7 @@ def _check_digest(mapper: Mapper) -> None:
     told = derived_digest(model_planes(mapper.snapshot().changed), counts)
     assert told == digest.derived, "snapshot and digest disagree"
     anew = type(mapper)(mapper.settings)
-    anew._store = _AllDirty(mapper._store)  # type: ignore[assignment]
+    _unsettled(mapper._store, anew._store)
     anew._free = mapper._free
     anew.update()
     assert anew.digest() == digest, "the map is not what its integers derive to"
