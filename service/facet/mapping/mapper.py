@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from facet.mapping.bends import Bends
 from facet.mapping.blocks import pack, unpack
 from facet.mapping.census import Census, tile_points
 from facet.mapping.contours import ContourField
@@ -58,6 +59,7 @@ class Mapper:
         self._normals = NormalField(self.settings)
         self._patches = PatchField(self.settings)
         self._tiles = TileField()
+        self._bends = Bends(self.settings, self._store, self._normals, self._patches, self._tiles)
         self._contours = ContourField(self.settings)
         self._identity = Identity()
         self._describer = Describer(self.settings)
@@ -104,7 +106,7 @@ class Mapper:
         )
         done("tiles")
         self._table = tabulate(self._tiles.tiles)
-        self._planes = group_planes(self._table, limit, self.settings)
+        self._planes = group_planes(self._table, limit, self.settings, self._bends.flat)
         points = fit_points(self._table, self._planes, self.settings.voxel_m)
         done("planes")
         lineage = self._identity.assign(len(points.total), self._heritage())

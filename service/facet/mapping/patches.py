@@ -246,9 +246,12 @@ def _nearest(planes, boxes, count, local, seen, tolerance, avoid):  # type: igno
     for q in range(count):
         u = planes[q]
         w = abs(u[0] * c0 + u[1] * c1 + u[2] * c2 - u[3])
-        if w > tolerance or (not mixed and u[0] * v0 + u[1] * v1 + u[2] * v2 <= 0.0):
+        if w > tolerance:
             continue
-        if avoid >= 0:
+        if avoid < 0:
+            if not mixed and u[0] * v0 + u[1] * v1 + u[2] * v2 <= 0.0:
+                continue
+        else:  # whoever claims a corner need not be seen from the same side
             o = planes[avoid]
             if u[0] * o[0] + u[1] * o[1] + u[2] * o[2] > CORNER_COS:
                 continue
@@ -323,7 +326,8 @@ def _add_points(blocks, moments, border, patches, block, pure, m):  # type: igno
             bit = np.int64(trailing_zeros(word))
             word &= word - np.uint64(1)
             row = blocks.rows[block, 64 * z + bit]
-            p = patches.member[row]
+            own_label = patches.label[row]
+            p = own_label & 15 if own_label >> 4 == CENTRE else -1
             if p < 0 or (pure and (border[row] or patches.second[row] >= 0)):
                 continue
             own = moments[row]

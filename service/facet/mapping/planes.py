@@ -7,6 +7,7 @@ planes merge across gaps, freed tile-planes are offered to the survivors (stage 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -21,6 +22,11 @@ from facet.mapping.tiles import Tile
 
 FREE = -1
 ENOUGH_POINTS = 200  # pure points that a plane is fitted to
+
+
+Judge = Callable[
+    [NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Nodes], NDArray[np.bool_]
+]
 
 
 class Table(NamedTuple):
@@ -87,8 +93,10 @@ def tabulate(tiles: dict[int, Tile]) -> Table:
     )
 
 
-def group_planes(table: Table, limit: Limits, settings: MapSettings) -> PlaneSet:
-    """Stages 2 to 4 over a table of tile-planes."""
+def group_planes(
+    table: Table, limit: Limits, settings: MapSettings, flat: Judge | None = None
+) -> PlaneSet:
+    """Stages 2 to 4 over a table of tile-planes. `flat` says which planes are none after all."""
     stages = Stages(seeds=len(table.nodes.votes))
     roots, merged = merge_nodes(table.nodes, table.edges, limit)
     label, nodes = _relabel(roots, merged)
@@ -99,6 +107,8 @@ def group_planes(table: Table, limit: Limits, settings: MapSettings) -> PlaneSet
     keep, least, stages.detail_reached = detail_level(occupation, settings)
     keep &= nodes.votes >= settings.member_share * least  # leftovers alone make no plane
     stages.min_occupation = least
+    if flat is not None:
+        keep[keep] = flat(table.tile_keys, table.starts, *_drop(label, nodes, keep))
     stages.detailed = int(keep.sum())
     label, nodes = _drop(label, nodes, keep)
 

@@ -57,6 +57,9 @@ class MapSettings:
     merge_sigmas: float = 3.0
     max_merged_sigma_m: float = 0.025
     min_area_m2: float = 0.25  # n_occ is never above this many square metres of voxels
+    min_width: float = 2.5  # a narrower strip has no normal of its own
+    strip_width: float = 24.0  # a narrower plane is a strip, which must not be bent
+    bend_deg: float = 12.0  # that the normals of a strip may turn across it
     member_share: float = 0.5  # of n_occ, that must be voxels with a valid normal
     min_surface_m2: float = 0.05
     # free space
