@@ -1,0 +1,210 @@
+"""Voxels hold exact moments: those of a plain sum, in any order, and undone to the bit."""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.typing import NDArray
+
+from facet.mapping.blocks import pack_all
+from facet.mapping.digest import state_digest
+from facet.mapping.freespace import FreeSpace
+from facet.mapping.invariants import check_blocks, check_moments, check_observables
+from facet.mapping.quantise import VIEW, Ticks
+from facet.mapping.store import VoxelStore, observe
+
+NOBODY = np.zeros((0, 3), np.int64)
+
+
+def ticks_of(seed: int, count: int, width: int = 12, pose_hash: int = -1) -> Ticks:
+    """Random points in `width` voxels about the origin, with random views."""
+    rng = np.random.default_rng(seed)
+    points = rng.integers(-512 * width, 512 * width, (count, 3))
+    views = rng.normal([1.5, 0.0, 0.0], 1.0, (count, 3))
+    views = np.floor(views / np.linalg.norm(views, axis=1, keepdims=True) * VIEW + 0.5)
+    return Ticks(points, views.astype(np.int16), NOBODY, np.zeros(3, np.int64), pose_hash, {})
+
+
+def table(store: VoxelStore) -> dict[tuple[int, int, int], tuple[list[int], ...]]:
+    """Occupied voxels by index: moments, views, poses."""
+    rows = store.occupied_rows()
+    c = store.columns
+    poses = c.poses[rows] if len(c.poses) else np.zeros((len(rows), 3), np.int64)
+    columns = zip(
+        store.voxel_keys(rows).tolist(), c.moments[rows].tolist(), c.views[rows].tolist(),
+        poses.tolist(), strict=True,
+    )  # fmt: skip
+    return {tuple(key): (m, v, h) for key, m, v, h in columns}
+
+
+def plain(scans: list[Ticks]) -> dict[tuple[int, int, int], tuple[list[int], ...]]:
+    """The same sums by Python integers."""
+    sums: dict[tuple[int, int, int], tuple[list[int], ...]] = {}
+    for scan in scans:
+        for p, view in zip(scan.points.tolist(), scan.views.tolist(), strict=True):
+            m, v, h = sums.setdefault(tuple(c // 1024 for c in p), ([0] * 10, [0] * 3, [0] * 3))
+            x, y, z = (c % 1024 for c in p)
+            for i, s in enumerate((1, x, y, z, x * x, x * y, x * z, y * y, y * z, z * z)):
+                m[i] += s
+            for i in range(3):
+                v[i] += view[i]
+            if scan.pose_hash >= 0:
+                for i, s in enumerate((1, scan.pose_hash, scan.pose_hash**2)):
+                    h[i] += s
+    return sums
+
+
+def filled(scans: list[Ticks]) -> VoxelStore:
+    store = VoxelStore()
+    for scan in scans:
+        store.insert(scan)
+    return store
+
+
+def digest(store: VoxelStore) -> str:
+    return state_digest(store, FreeSpace())
+
+
+def test_moments_are_those_of_a_plain_sum() -> None:
+    scans = [ticks_of(s, 3000, pose_hash=h) for s, h in enumerate((-1, 17, 60_000, -1, 17))]
+    store = filled(scans)
+    assert table(store) == plain(scans)
+    check_blocks(store)
+    check_moments(store)
+    store.settle()
+    check_observables(store)
+
+
+def test_moments_of_a_voxel_are_those_of_its_points() -> None:
+    points = np.random.default_rng(4).integers(0, 1024, (5000, 3))
+    scan = ticks_of(0, 5000)._replace(points=points)
+    m = filled([scan]).columns.moments[0].astype(float)
+    spread = np.cov(points.T, bias=True)
+    found = m[4:] / m[0] - np.outer(m[1:4], m[1:4])[np.triu_indices(3)] / m[0] ** 2
+    np.testing.assert_allclose(found, spread[np.triu_indices(3)], rtol=1e-9)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.permutations(range(5)), st.integers(0, 1000))
+def test_any_order_of_scans_gives_the_same_state(order: list[int], seed: int) -> None:
+    scans = [ticks_of(seed + k, 200, pose_hash=k * 999 - 1) for k in range(5)]
+    assert digest(filled([scans[k] for k in order])) == digest(filled(scans))
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 1000), st.integers(0, 300), st.integers(0, 300))
+def test_insert_then_remove_is_the_identity(seed: int, base: int, more: int) -> None:
+    kept, gone = ticks_of(seed, base), ticks_of(seed + 1, more, pose_hash=seed % 3 - 1)
+    store = filled([kept])
+    store.settle()
+    store.insert(gone)
+    if seed % 2:
+        store.settle()
+    store.remove(gone)
+    store.settle()
+    fresh = filled([kept])
+    fresh.settle()
+    assert digest(store) == digest(fresh)
+    assert observables(store) == observables(fresh)
+    check_observables(store)
+    check_moments(store)
+
+
+def observables(store: VoxelStore) -> dict[int, int]:
+    rows = store.occupied_rows()
+    keys = pack_all(store.voxel_keys(rows)).tolist()
+    return dict(zip(keys, store.columns.observable[rows].tolist(), strict=True))
+
+
+def test_removed_before_inserted_comes_to_nothing() -> None:
+    scan = ticks_of(3, 500)
+    store = VoxelStore()
+    store.remove(scan)
+    store.insert(scan)
+    assert len(store.occupied_rows()) == 0
+    assert digest(store) == digest(VoxelStore())
+
+
+def test_growing_loses_nothing() -> None:
+    """Past every first capacity, with line scans only at the end."""
+    scans = [ticks_of(k, 40_000, width=400) for k in range(3)]
+    scans.append(ticks_of(9, 20_000, width=400, pose_hash=5))
+    store = filled(scans)
+    assert store.num_blocks > 4096
+    assert int(store.columns.moments[:, 0].sum()) == 140_000
+    assert int(store.columns.poses[:, 0].sum()) == 20_000
+    check_blocks(store)
+    check_moments(store)
+
+
+def test_settle_tells_what_changed_and_only_that() -> None:
+    store = filled([ticks_of(0, 4000)])
+    first = store.settle()
+    assert sorted(first.tolist()) == sorted(store.occupied_rows().tolist())
+    assert len(store.settle()) == 0
+    before = store.columns.observable.copy()
+    store.insert(ticks_of(1, 300))
+    touched = set(store.touched_rows.tolist())
+    dirty = set(store.settle().tolist())
+    changed = set(
+        np.flatnonzero(before[: store.num_rows] != store.columns.observable[: store.num_rows])
+    )
+    assert dirty == changed
+    assert dirty <= touched
+    check_observables(store)
+
+
+def seen(
+    moments: list[int], views: tuple[int, int, int], poses: tuple[int, ...] = ()
+) -> dict[str, object]:
+    """The parts of an observable."""
+    full = np.zeros(10, np.int64)
+    full[: len(moments)] = moments
+    word = int(observe(full, np.array(views, np.int64), np.array(poses, np.int64)))
+    return {
+        "centroid": tuple((word >> s) & 15 for s in (0, 4, 8)),
+        "votes": (word >> 12) & 15,
+        "view": tuple(((word >> s) & 31) - 8 for s in (16, 21, 26)),
+        "mixed": bool((word >> 31) & 1),
+        "pose": (word >> 32) & 0x1FFFF,
+    }
+
+
+def test_an_observable_is_a_rounded_view() -> None:
+    told = seen([2, 1024, 0, 2046], (254, 0, 0))
+    assert told == {"centroid": (4, 0, 8), "votes": 2, "view": (8, 0, 0), "mixed": False, "pose": 0}
+    assert seen([1, 63, 64, 191], (0, 0, -127))["centroid"] == (0, 1, 1)
+    assert seen([1, 63, 64, 192], (0, 0, -127))["centroid"] == (0, 1, 2)
+    assert seen([20, 0, 0, 0], (0, 2540, 0))["votes"] == 8
+
+
+def test_a_voxel_seen_from_both_sides_is_mixed() -> None:
+    assert seen([4, 0, 0, 0], (0, 0, 0))["mixed"]
+    assert seen([4, 0, 0, 0], (127, 0, 0))["mixed"]  # a quarter
+    assert not seen([4, 0, 0, 0], (3 * 127, 0, 0))["mixed"]
+
+
+def test_a_voxel_knows_its_only_line_pose() -> None:
+    assert seen([3, 0, 0, 0], (381, 0, 0), (3, 21, 147))["pose"] == 8  # hash 7 thrice
+    assert seen([3, 0, 0, 0], (381, 0, 0), (3, 22, 164))["pose"] == 0  # 7, 7, 8
+    assert seen([3, 0, 0, 0], (381, 0, 0), (2, 14, 98))["pose"] == 0  # and one of a cloud
+    assert seen([2, 0, 0, 0], (254, 0, 0), (2, 0, 0))["pose"] == 1  # hash 0
+
+
+def test_an_empty_voxel_has_no_observable() -> None:
+    nothing: NDArray[np.int64] = np.zeros(10, np.int64)
+    assert observe(nothing, np.zeros(3, np.int64), np.zeros(0, np.int64)) == 0
+
+
+def test_the_mean_observable_fades_as_one_over_n() -> None:
+    """One more point flips a voxel's observable with p of about 4/n (design 1.2)."""
+    rng, flips = np.random.default_rng(5), {}
+    store = VoxelStore()
+    for n in range(1, 161):
+        points = rng.integers(0, 1024, (400, 3)) + np.arange(400)[:, None] * [1024, 0, 0]
+        views = np.tile(np.array([VIEW, 0, 0], np.int16), (400, 1))
+        store.insert(Ticks(points, views, NOBODY, np.zeros(3, np.int64), -1, {}))
+        flips[n] = len(store.settle()) / 400
+    late = np.mean([n * flips[n] for n in range(80, 161)])
+    assert 1.0 < late < 8.0
