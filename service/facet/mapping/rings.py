@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 OUTWARD = 2.0  # grid units (1/8 voxel): a border centroid sits inside its voxel
-_SHIFT = 1 << 31
+_SHIFT = 1 << 30  # keys of vertices sort as vertices do
 
 
 class Outline(NamedTuple):
