@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
+from figures import FOLDER, Figure, at_most, report, skip
 from numpy.typing import NDArray
 
 from facet.export.model import build_model
@@ -20,7 +21,6 @@ from facet.mapping.mapper import Mapper
 from facet.mapping.settings import MapSettings
 from facet.warmup import warm_up
 from facet_protocol.messages import Plane
-from figures import FOLDER, Figure, at_most, report, skip
 from scenes import SHARED_DATA, recorded
 
 NEAR_DEG, NEAR_M, NEAR_M2 = 6.0, 0.06, 0.5  # a plane this near and large is a piece of the same

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from figures import Figure, at_least, at_most, none_of, report
 
 from facet.commands.terminal import out
 from facet.mapping.mapper import Mapper
@@ -17,7 +18,6 @@ from facet.simulate import Noise, Observer, Simulation, Truth
 from facet.warmup import warm_up
 from facet_protocol.messages import LineFan
 from facet_protocol.scans import project
-from figures import Figure, at_least, at_most, none_of, report
 from scorer import Score, model_of, score
 
 SMALL_M2 = 1.0  # surfaces under it may be off by 2 degrees
