@@ -69,7 +69,7 @@ def test_a_square_with_a_hole_is_one_outer_ring_and_one_hole() -> None:
 
 
 def test_surfaces_apart_are_two() -> None:
-    points = np.concatenate([lattice(0, 160), lattice(0, 240) + (400, 0)])
+    points = np.concatenate([lattice(0, 160), np.add(lattice(0, 240), [400, 0])])
     assert [len(s.holes) for s in surfaces_of(tiled(points), 100.0)] == [0, 0]
     assert len(surfaces_of(tiled(points), 200.0**2)) == 1
 

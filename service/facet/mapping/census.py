@@ -38,7 +38,7 @@ class Census:
         self, store: VoxelStore, normals: Normals, tiles: TileField, sigma_m: float
     ) -> MapCounts:
         """All counts, as of the last update."""
-        rows = store.occupied_rows()
+        rows = np.flatnonzero(store.columns.observable[: store.num_rows])  # as last settled
         kinds = np.bincount(normals.kind[rows], minlength=6)
         placed = np.zeros(max(store.num_rows, 1), np.bool_)
         for tile in tiles.tiles.values():

@@ -134,12 +134,16 @@ def _centre(ring: NDArray[np.int32], frame: object) -> NDArray[np.float64]:
 
 
 def _key(own: Figures, contour: Contour) -> tuple[bytes, ...]:
+    seen = own.sighting
     return (
         own.fit.inside.tobytes(),
         np.float64(own.fit.offset_m).tobytes(),
         np.float64(own.fit.sigma_n_m).tobytes(),
         own.centroid.tobytes(),
-        repr((own.num_points, own.num_voxels, contour.rounded, own.sighting)).encode(),
+        repr(
+            (own.num_points, own.num_voxels, contour.rounded, seen.first_ns, seen.last_ns)
+        ).encode(),
+        repr(sorted(seen.robots)).encode(),  # a set has an order of its own in every process
     )
 
 
