@@ -22,8 +22,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from figures import Figure, at_least, at_most, report
 
+from benchmarks.figures import Figure, at_least, at_most, report
 from facet.commands.terminal import out
 from facet.sources.naming import is_scan
 from facet.sources.recording import Recording

@@ -12,8 +12,7 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
-from figures import Figure, at_most, report
-
+from benchmarks.figures import Figure, at_most, report
 from facet.commands.terminal import table
 from facet.mapping.mapper import Mapper
 from facet.mapping.report import MapCounts, StageReport

@@ -12,9 +12,9 @@ from dataclasses import asdict, dataclass, field
 from typing import Any
 
 import numpy as np
-from figures import FOLDER, Figure, at_most, report, skip
 from numpy.typing import NDArray
 
+from benchmarks.figures import FOLDER, Figure, at_most, report, skip
 from facet.export.model import build_model
 from facet.export.picture import write_picture
 from facet.mapping.mapper import Mapper
@@ -41,8 +41,7 @@ class Known:
 class Place:
     name: str
     known: tuple[Known, ...]
-    settings: MapSettings
-    note: str = ""
+    suited: MapSettings  # to its sensor and noise; the defaults are judged as well
     apart: tuple[tuple[str, str, float, float], ...] = field(default=())  # names, m, tolerance
 
 
@@ -56,7 +55,7 @@ PLACES = (
             Known("leg 2 far", Y, 8.85, 0.03), Known("leg 2 near", Y, 6.78, 0.03),
             Known("leg 3", X, -10.46, 0.03),
         ),
-        MapSettings(),
+        MapSettings(voxel_m=0.15, max_merged_sigma_m=0.05, merge_sigmas=5.0),
     ),
     Place(
         "rooms",
@@ -75,7 +74,7 @@ PLACES = (
             Known("panel 2", (-0.77, 0.64, 0.0), 2.35, 0.02, 1.5),
             Known("panel 3", (-0.63, -0.78, 0.0), 1.65, 0.02, 1.5),
         ),
-        MapSettings(),
+        MapSettings(voxel_m=0.06),
     ),
 )  # fmt: skip
 
@@ -115,10 +114,12 @@ def angle_deg(a: NDArray[np.float64], b: NDArray[np.float64]) -> float:
     return float(np.degrees(np.arccos(min(1.0, abs(float(a @ b))))))
 
 
-def map_place(place: Place, num_scans: int | None = None) -> tuple[Mapper, float]:
+def map_place(
+    place: Place, settings: MapSettings, num_scans: int | None = None
+) -> tuple[Mapper, float]:
     """All scans, then one update; seconds of both."""
-    warm_up(place.settings)
-    mapper, scans = Mapper(place.settings, place.name), list(recorded(place.name, num_scans))
+    warm_up(settings)
+    mapper, scans = Mapper(settings, place.name), list(recorded(place.name, num_scans))
     started = time.perf_counter()
     for scan in scans:
         mapper.insert(scan)
@@ -148,32 +149,48 @@ def judge(place: Place, planes: tuple[Plane, ...]) -> list[Figure]:
     return figures
 
 
+def run(place: Place, name: str, settings: MapSettings) -> tuple[list[Figure], dict[str, Any]]:
+    """One place with one choice of settings: figures, details, and a picture."""
+    mapper, seconds = map_place(place, settings)
+    snapshot, counts = mapper.snapshot(), mapper.counts()
+    found = mapper.report()
+    figures = [
+        *judge(place, snapshot.changed),
+        Figure(f"{place.name}: planes", len(snapshot.changed)),
+        Figure(f"{place.name}: noise sigma_N, mm", 1e3 * counts.sigma_n_m),
+        Figure(f"{place.name}: discarded points, %", found.discarded_points_percent),
+        Figure(f"{place.name}: {counts.points_in:,} points to contours, s", seconds),
+    ]
+    model = build_model(snapshot, counts, mapper.settings.as_dict(), mapper.digest())
+    FOLDER.mkdir(parents=True, exist_ok=True)
+    write_picture(model, FOLDER / f"real-{place.name}-{name}.png")
+    details = {
+        "settings": asdict(settings),
+        "counts": counts.as_dict(),
+        "report": found.as_dict(),
+        "seconds": seconds,
+    }
+    return figures, details
+
+
+def changed(settings: MapSettings) -> str:
+    """What differs from the defaults."""
+    usual = MapSettings().as_dict()
+    return ", ".join(f"{k} {v:g}" for k, v in settings.as_dict().items() if v != usual[k])
+
+
 def main(arguments: list[str]) -> None:
     """`real.py [PLACE]`."""
     if not SHARED_DATA.exists():
         skip(f"no recordings at {SHARED_DATA}")
-    figures: list[Figure] = []
-    details: dict[str, Any] = {}
-    for place in (p for p in PLACES if not arguments or p.name == arguments[0]):
-        mapper, seconds = map_place(place)
-        snapshot, counts = mapper.snapshot(), mapper.counts()
-        figures += judge(place, snapshot.changed)
-        figures += [
-            Figure(f"{place.name}: planes", len(snapshot.changed)),
-            Figure(f"{place.name}: noise sigma_N, mm", 1e3 * counts.sigma_n_m),
-            Figure(f"{place.name}: discarded points, %", mapper.report().discarded_points_percent),
-            Figure(f"{place.name}: {counts.points_in:,} points to contours, s", seconds),
-        ]
-        details[place.name] = {
-            "settings": asdict(place.settings),
-            "counts": counts.as_dict(),
-            "report": mapper.report().as_dict(),
-            "seconds": seconds,
-        }
-        model = build_model(snapshot, counts, mapper.settings.as_dict(), mapper.digest())
-        FOLDER.mkdir(parents=True, exist_ok=True)
-        write_picture(model, FOLDER / f"real-{place.name}.png")
-    report("real", "Real recordings", figures, {"places": details})
+    for name in ("default", "suited"):
+        figures: list[Figure] = []
+        details: dict[str, Any] = {}
+        for place in (p for p in PLACES if not arguments or p.name == arguments[0]):
+            settings = MapSettings() if name == "default" else place.suited
+            more, details[place.name] = run(place, name, settings)
+            figures += [Figure(f"{place.name}: settings", changed(settings) or "default"), *more]
+        report(f"real-{name}", f"Real recordings, {name} settings", figures, {"places": details})
 
 
 if __name__ == "__main__":

@@ -6,8 +6,8 @@ import time
 from typing import Any
 
 import numpy as np
-from figures import Figure, at_most, report
 
+from benchmarks.figures import Figure, at_most, report
 from facet.commands.terminal import table
 from facet.mapping.mapper import Mapper
 from facet.mapping.settings import MapSettings

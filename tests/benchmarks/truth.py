@@ -8,8 +8,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from figures import Figure, at_least, at_most, none_of, report
 
+from benchmarks.figures import Figure, at_least, at_most, none_of, report
 from facet.commands.terminal import out
 from facet.mapping.mapper import Mapper
 from facet.mapping.settings import MapSettings
