@@ -1,1 +1,1 @@
-"""The core: scans in, planes out. Pure functions of integers; no clock, no I/O, no threads, no logs."""
+"""The core: scans in, planes out. Pure functions of integers; no clock, I/O, threads or logs."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -42,7 +42,7 @@ def pack_all(ijk: Int64Array) -> Int64Array:
 
 
 @njit(cache=True, nogil=True)
-def hash_key(key: int) -> int:
+def hash_key(key: Any) -> Any:
     """A 63-bit mix (splitmix64's finaliser)."""
     z = np.uint64(key)
     z = (z ^ (z >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -51,7 +51,7 @@ def hash_key(key: int) -> int:
 
 
 @njit(cache=True, nogil=True)
-def find(table_keys: Int64Array, table_values: NDArray[np.int32], key: int) -> int:
+def find(table_keys: Int64Array, table_values: NDArray[np.int32], key: Any) -> Any:
     """The value stored under `key`, or -1. Table size is a power of two, never full."""
     mask = table_keys.shape[0] - 1
     slot = hash_key(key) & mask

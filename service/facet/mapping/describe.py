@@ -61,11 +61,11 @@ class Describer:
         """Describe all planes again where anything changed. Returns the changed ids, ascending."""
         for gone in self._entries.keys() - figures.keys():
             del self._entries[gone]
-        changed = []
-        for plane_id in sorted(figures):
-            if self._refresh(plane_id, figures[plane_id], contours[plane_id], free):
-                changed.append(plane_id)
-        return changed
+        return [
+            plane_id
+            for plane_id in sorted(figures)
+            if self._refresh(plane_id, figures[plane_id], contours[plane_id], free)
+        ]
 
     def _refresh(self, plane_id: int, own: Figures, contour: Contour, free: FreeSpace) -> bool:
         key = _key(own, contour)

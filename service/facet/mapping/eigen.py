@@ -26,7 +26,7 @@ def eigenvalues(a, b, c, d, e, f):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def eigenvector(a, b, c, d, e, f, value):  # type: ignore[no-untyped-def]
-    """Unit eigenvector of the matrix above for a simple eigenvalue; (0, 0, 1) where none is clear."""
+    """Unit eigenvector of that matrix for a simple eigenvalue; (0, 0, 1) where none is clear."""
     x0, y0, z0 = a - value, d, e
     x1, y1, z1 = d, b - value, f
     x2, y2, z2 = e, f, c - value

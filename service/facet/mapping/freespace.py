@@ -1,4 +1,4 @@
-"""Free space: how many beams passed each coarse cell. Integer traversal, additive, undone exactly."""
+"""Free space: how many beams passed each coarse cell. Integers, additive, undone exactly."""
 
 from __future__ import annotations
 

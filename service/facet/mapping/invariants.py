@@ -131,7 +131,7 @@ def _check_labels(mapper: Mapper) -> None:
         near, index = labels[on] >> 4, labels[on] & 15
         home = np.where(near == CENTRE, block[on], store.blocks.neighbours[block[on], near])
         assert np.all(home >= 0), f"a {name} names a block that is not there"
-        assert np.all(index < patches.count[home]), f"a {name} names a patch that is not there"
+        assert np.all(index < patches.number[home]), f"a {name} names a patch that is not there"
     times = np.zeros(count, np.int64)
     for tile in mapper._tiles.tiles.values():
         own = tile.rows[~tile.corner]
@@ -141,7 +141,7 @@ def _check_labels(mapper: Mapper) -> None:
     assert np.array_equal(times, patches.label[:count] >= 0), "a voxel is on two tile-planes"
     held = sum(int(t.points[:, 0].sum()) for t in mapper._tiles.tiles.values())
     assert held <= mapper._census._points_stored, "tile-planes hold more points than there are"
-    votes = patches.votes[np.arange(patches.votes.shape[1]) < patches.count[:, None]].sum()
+    votes = patches.votes[np.arange(patches.votes.shape[1]) < patches.number[:, None]].sum()
     assert mapper._patches.histogram.sum() == votes, "the histogram of noise forgot a patch"
 
 

@@ -76,7 +76,7 @@ def plane_of(votes, scatter, unit):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def pool(va, ma, sa, vb, mb, sb, mean, scatter):  # type: ignore[no-untyped-def]
-    """P1, P2: mean and scatter of the union, written to the last two (Chan, Golub, LeVeque 1979)."""
+    """P1, P2: mean and scatter of the union, into the last two (Chan, Golub & LeVeque 1979)."""
     total = va + vb
     k = va * vb / total
     d0, d1, d2 = mb[0] - ma[0], mb[1] - ma[1], mb[2] - ma[2]

@@ -80,6 +80,17 @@ def _cut(gaps, ends, count, begin, length, q):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
+def _surrounded(window, row, column):  # type: ignore[no-untyped-def]
+    """Whether the eight cells round a cell all hold points. Then no point in it is on the boundary:
+    whichever way the disc lies, it swallows one of these cells whole."""
+    for dv in range(-1, 2):
+        for du in range(-1, 2):
+            if window[row + dv, column + du] == np.uint64(0):
+                return False
+    return True
+
+
+@njit(cache=True, nogil=True)
 def _roll(window, begin, length, around, edges):  # type: ignore[no-untyped-def]
     """Edges (u, v, u', v') that start in the window's middle tile, grid units from the tile's
     corner. Returns how many, or -1 where `edges` is too short."""
@@ -89,6 +100,8 @@ def _roll(window, begin, length, around, edges):  # type: ignore[no-untyped-def]
     for row in range(CELLS):
         for column in range(CELLS):
             word = window[row + HALO, column + HALO]
+            if word == np.uint64(0) or _surrounded(window, row + HALO, column + HALO):
+                continue
             while word != np.uint64(0):
                 bit = np.int64(trailing_zeros(word))
                 word &= word - np.uint64(1)

@@ -82,7 +82,7 @@ def _to_ticks(points, R, t, tick_m, near, far, bound_m, ticks, views, counts):  
 
 
 def quantise(scan: Scan, settings: MapSettings) -> Ticks:
-    """Integer ticks of a scan's points and empty beams; what cannot be mapped is counted by reason."""
+    """A scan's points and empty beams in integer ticks; what cannot be mapped is counted."""
     tick_m = settings.tick_m
     bound_m = min(50_000.0, BOUND * settings.voxel_m)
     R = rotation(scan.pose)

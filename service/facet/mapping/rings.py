@@ -106,7 +106,7 @@ def stitch(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     return rings
 
 
-def signed_area(ring: NDArray[np.int64]) -> float:
+def signed_area(ring: NDArray[np.int64] | NDArray[np.int32]) -> float:
     """Shoelace, positive counter-clockwise."""
     u, v = ring[:, 0].astype(np.int64), ring[:, 1].astype(np.int64)
     return float(np.sum(u * np.roll(v, -1) - np.roll(u, -1) * v)) / 2.0
@@ -149,7 +149,7 @@ def surfaces_of(edges: NDArray[np.int64], least_area: float) -> list[Outline]:
     for (outer, _), own in zip(outers, holes, strict=True):
         grown = outward(outer)
         shrunk = [h for h in (outward(hole) for hole in own) if signed_area(h) < 0.0]
-        area = signed_area(grown) + sum(signed_area(h) for h in shrunk)
+        area = signed_area(grown) + float(sum(signed_area(h) for h in shrunk))
         outlines.append(Outline(grown, shrunk, area))
     return outlines
 
@@ -164,4 +164,4 @@ def outward(ring: NDArray[np.int64]) -> NDArray[np.int32]:
     norm2 = np.maximum(np.sum(mean * mean, axis=1), 0.5)  # a miter of at most 2.8
     moved = np.floor(p + OUTWARD * 2.0 * mean / norm2[:, None] + 0.5).astype(np.int32)
     keep = np.any(moved != np.roll(moved, 1, axis=0), axis=1)
-    return moved[keep] if int(keep.sum()) > 2 else moved
+    return np.asarray(moved[keep] if int(keep.sum()) > 2 else moved, dtype=np.int32)

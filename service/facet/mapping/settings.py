@@ -15,7 +15,7 @@ ALPHA2 = 1603  # squared alpha radius of contours, (1/8 voxel)^2: 5.005 voxels.
 
 @dataclass(frozen=True, slots=True)
 class MapSettings:
-    """Settings of one map. Lengths without `_m` are in voxels; angles in degrees at this door only."""
+    """Settings of one map. Lengths without `_m` are in voxels; angles are degrees here only."""
 
     voxel_m: float = 0.05
     theta_deg: float = 15.0  # thickness angle above which a normal is refused (paper: 9 to 15)

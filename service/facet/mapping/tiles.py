@@ -12,8 +12,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from facet.mapping.bits import trailing_zeros
-from facet.mapping.blocks import CENTRE, find, pack, pack_all, unpack, unpack_all
+from facet.mapping.blocks import CENTRE, pack, pack_all, unpack, unpack_all
+from facet.mapping.membership import collect, inherit, shell
 from facet.mapping.merging import Limits, Nodes, merge_nodes
 from facet.mapping.normals import UNIT
 from facet.mapping.patches import PER_BLOCK, PatchField
@@ -40,7 +40,7 @@ class Tile:
     # pairs: (own tile-plane, key of the other tile, its tile-plane), adjacent
     ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     heritage: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 3), np.int64))
-    # heritage: (plane id at the last update, tile-plane, voxels they share); ids: (T,) of last update
+    # ids: (T,) at the last update; heritage: (plane id then, tile-plane now, voxels they share)
 
     @property
     def num_planes(self) -> int:
@@ -58,7 +58,7 @@ def _tile_nodes(block_keys, neighbours, patches, which, tile_key):  # type: igno
         i, j, k = unpack(block_keys[which[q]])
         place[q] = (i - 8 * ti) + 8 * (j - 8 * tj) + 64 * (k - 8 * tk)
         first[place[q]] = count
-        count += patches.count[which[q]]
+        count += patches.number[which[q]]
     votes = np.empty(count)
     mean = np.empty((count, 3))
     scatter = np.empty((count, 6))
@@ -70,7 +70,7 @@ def _tile_nodes(block_keys, neighbours, patches, which, tile_key):  # type: igno
         block = which[q]
         i, j, k = unpack(block_keys[block])
         corner = (BLOCK * i, BLOCK * j, BLOCK * k)
-        for p in range(patches.count[block]):
+        for p in range(patches.number[block]):
             v = float(patches.votes[block, p])
             votes[t] = v
             c = patches.centroid[block, p]
@@ -93,8 +93,8 @@ def _tile_nodes(block_keys, neighbours, patches, which, tile_key):  # type: igno
             if other < 0:
                 continue
             start = first[x + 8 * y + 64 * z]
-            for p in range(patches.count[block]):
-                for o in range(patches.count[other]):
+            for p in range(patches.number[block]):
+                for o in range(patches.number[other]):
                     if n == CENTRE and o <= p:
                         continue
                     if num_edges == edges.shape[0]:
@@ -118,7 +118,7 @@ def _gather_points(block_keys, patches, which, tile_key, plane_of_patch, count):
         i, j, k = unpack(block_keys[block])
         step = TICKS * BLOCK
         d = (step * (i - 8 * ti), step * (j - 8 * tj), step * (k - 8 * tk))
-        for p in range(patches.count[block]):
+        for p in range(patches.number[block]):
             m = out[plane_of_patch[block, p]]
             total[plane_of_patch[block, p]] += patches.total[block, p]
             own = patches.points[block, p]
@@ -135,73 +135,37 @@ def _gather_points(block_keys, patches, which, tile_key, plane_of_patch, count):
 
 
 @njit(cache=True, nogil=True)
-def _collect(blocks, patches, plane_of_patch, tile_key, which, rows, owner, corner):  # type: ignore[no-untyped-def]
-    """Voxels of the blocks `which` whose patch, own or claiming, lies in the tile. How many."""
-    ti, tj, tk = unpack(tile_key)
-    count = 0
-    for q in range(which.shape[0]):
-        block = which[q]
-        i, j, k = unpack(blocks.keys[block])
-        for z in range(8):
-            word = blocks.occupied[block, z]
-            while word != np.uint64(0):
-                bit = np.int64(trailing_zeros(word))
-                word &= word - np.uint64(1)
-                row = blocks.rows[block, 64 * z + bit]
-                for claim in range(2):
-                    label = patches.second[row] if claim else patches.label[row]
-                    if label < 0:
-                        continue
-                    n = label >> 4
-                    x, y, w = i + n % 3 - 1, j + (n // 3) % 3 - 1, k + n // 9 - 1
-                    if x >> 3 != ti or y >> 3 != tj or w >> 3 != tk:
-                        continue
-                    other = block if n == CENTRE else blocks.neighbours[block, n]
-                    rows[count] = row
-                    owner[count] = plane_of_patch[other, label & 15]
-                    corner[count] = claim == 1
-                    count += 1
-    return count
-
-
-@njit(cache=True, nogil=True)
 def _pairs(blocks, patches, plane_of_patch, tile_key, which, out):  # type: ignore[no-untyped-def]
-    """Adjacent tile-planes (own, key of the other tile, other) with the smaller first. How many."""
+    """Adjacent tile-planes, the smaller tile first, as own << 32 | place of the other tile among
+    the 27 << 16 | other; with repetitions. How many, or -1 where `out` is too short."""
     count = 0
+    ti, tj, tk = unpack(tile_key)
     for q in range(which.shape[0]):
         block = which[q]
         i, j, k = unpack(blocks.keys[block])
+        last = np.int64(-1)
         for n in range(27):
             other = block if n == CENTRE else blocks.neighbours[block, n]
-            if other < 0 or patches.count[other] == 0:
+            if other < 0 or patches.number[other] == 0:
                 continue
             x, y, z = i + n % 3 - 1, j + (n // 3) % 3 - 1, k + n // 9 - 1
             other_key = pack(x >> 3, y >> 3, z >> 3)
             if other_key < tile_key:
                 continue
-            for p in range(patches.count[block]):
-                for o in range(patches.count[other]):
-                    a, b = plane_of_patch[block, p], plane_of_patch[other, o]
+            place = ((x >> 3) - ti + 1) + 3 * ((y >> 3) - tj + 1) + 9 * ((z >> 3) - tk + 1)
+            for p in range(patches.number[block]):
+                for o in range(patches.number[other]):
+                    a = np.int64(plane_of_patch[block, p])
+                    b = np.int64(plane_of_patch[other, o])
                     if other_key == tile_key and a >= b:
+                        continue
+                    pair = (a << 32) | (place << 16) | b
+                    if pair == last:
                         continue
                     if count == out.shape[0]:
                         return -1
-                    out[count, 0], out[count, 1], out[count, 2] = a, other_key, b
-                    count += 1
-    return count
-
-
-@njit(cache=True, nogil=True)
-def _ring(table_keys, table_values, tile_key, out):  # type: ignore[no-untyped-def]
-    """Existing blocks of a tile and of the one-block shell round it, by ascending key."""
-    ti, tj, tk = unpack(tile_key)
-    count = 0
-    for i in range(8 * ti - 1, 8 * ti + 9):
-        for j in range(8 * tj - 1, 8 * tj + 9):
-            for k in range(8 * tk - 1, 8 * tk + 9):
-                block = find(table_keys, table_values, pack(i, j, k))
-                if block >= 0:
-                    out[count] = block
+                    out[count] = pair
+                    last = pair
                     count += 1
     return count
 
@@ -214,19 +178,6 @@ def tile_keys_of(block_keys):  # type: ignore[no-untyped-def]
         i, j, k = unpack(block_keys[b])
         out[b] = pack(i >> 3, j >> 3, k >> 3)
     return out
-
-
-@njit(cache=True, nogil=True)
-def _inherit(old_rows, old_owner, old_corner, rows, owner, corner, scratch, counts):  # type: ignore[no-untyped-def]
-    """counts[old, new]: voxels that went from one tile-plane to another. scratch (V,) stays 0."""
-    for m in range(old_rows.shape[0]):
-        if not old_corner[m]:
-            scratch[old_rows[m]] = old_owner[m] + 1
-    for m in range(rows.shape[0]):
-        if not corner[m] and scratch[rows[m]] > 0:
-            counts[scratch[rows[m]] - 1, owner[m]] += 1
-    for m in range(old_rows.shape[0]):
-        scratch[old_rows[m]] = 0
 
 
 def spread(tile_keys: NDArray[np.int64], block_keys: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -330,7 +281,7 @@ class TileField:
         roots, merged = merge_nodes(Nodes(votes, mean, scatter, unit), edges, limits)
         kept, index = np.unique(roots, return_inverse=True)
         tile.nodes = Nodes(*(np.ascontiguousarray(c[kept]) for c in merged))
-        counts = patches.patches.count[tile.blocks]
+        counts = patches.patches.number[tile.blocks]
         where = np.arange(PER_BLOCK)[None, :] < counts[:, None]
         plane_of_patch = np.zeros((len(tile.blocks), PER_BLOCK), np.int16)
         plane_of_patch[where] = index
@@ -341,18 +292,18 @@ class TileField:
 
     def _fill(self, store: VoxelStore, patches: PatchField, tile: Tile) -> None:
         near = np.empty(1000, np.int32)
-        near = near[: _ring(store.blocks.table_keys, store.blocks.table_values, tile.key, near)]
+        near = near[: shell(store.blocks.table_keys, store.blocks.table_values, tile.key, near)]
         most = 2 * int(np.bitwise_count(store.blocks.occupied[near]).sum())
         rows, owner = np.empty(most, np.int32), np.empty(most, np.int16)
         corner = np.empty(most, np.bool_)
-        count = _collect(
+        count = collect(
             store.blocks, patches.patches, self.plane_of_patch, tile.key, near, rows, owner, corner
         )
         if len(self._scratch) < len(store.columns.block):
             self._scratch = np.zeros(len(store.columns.block), np.int16)
         counts = np.zeros((len(tile.ids), tile.num_planes), np.int64)
         new = rows[:count].copy(), owner[:count].copy(), corner[:count].copy()
-        _inherit(tile.rows, tile.owner, tile.corner, *new, self._scratch, counts)
+        inherit(tile.rows, tile.owner, tile.corner, *new, self._scratch, counts)
         old, own = np.nonzero(counts)
         tile.heritage = np.stack([tile.ids[old], own, counts[old, own]], axis=1)
         tile.rows, tile.owner, tile.corner = new
@@ -373,19 +324,24 @@ class TileField:
     def _pair(self, store: VoxelStore, patches: PatchField, tile: Tile) -> None:
         room = 4096
         while True:
-            out = np.empty((room, 3), np.int64)
+            out = np.empty(room, np.int64)
             count = _pairs(
                 store.blocks, patches.patches, self.plane_of_patch, tile.key, tile.blocks, out
             )
             if count >= 0:
                 break
             room *= 4
-        tile.pairs = np.unique(out[:count], axis=0)
+        pairs = np.unique(out[:count])
+        place = (pairs >> 16) & 0xFFFF
+        offset = np.stack([place % 3, (place // 3) % 3, place // 9], axis=1) - 1
+        other = pack_all(np.array(unpack(tile.key)) + offset)
+        tile.pairs = np.stack([pairs >> 32, other, pairs & 0xFFFF], axis=1)
 
 
 def _empty_tile(key: int, blocks: NDArray[np.int32]) -> Tile:
     nodes = Nodes(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 6)), np.zeros((0, 3)))
     return Tile(
-        key, blocks, nodes, np.zeros((0, MOMENTS), np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64),
+        key, blocks, nodes, np.zeros((0, MOMENTS), np.int64),
+        np.zeros(0, np.int64), np.zeros(0, np.int64),
         np.zeros(0, np.int32), np.zeros(0, np.int16), np.zeros(0, np.bool_),
     )  # fmt: skip

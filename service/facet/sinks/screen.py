@@ -16,7 +16,7 @@ from types import TracebackType
 from urllib.parse import quote, urlsplit
 
 import rerun as rr
-import rerun_cli  # type: ignore[import-untyped]  # only where its binary lies
+import rerun_cli
 
 from facet.sinks.dashboard import Dashboard
 from facet_protocol.codec import Message

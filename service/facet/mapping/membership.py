@@ -1,0 +1,67 @@
+"""Which voxels belong to which tile-plane, and what they belonged to before."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from facet.mapping.bits import trailing_zeros
+from facet.mapping.blocks import CENTRE, find, pack, unpack
+
+
+@njit(cache=True, nogil=True)
+def collect(blocks, patches, plane_of_patch, tile_key, which, rows, owner, corner):  # type: ignore[no-untyped-def]
+    """Voxels of the blocks `which` whose patch, own or claiming, lies in the tile. How many."""
+    ti, tj, tk = unpack(tile_key)
+    count = 0
+    for q in range(which.shape[0]):
+        block = which[q]
+        i, j, k = unpack(blocks.keys[block])
+        for z in range(8):
+            word = blocks.occupied[block, z]
+            while word != np.uint64(0):
+                bit = np.int64(trailing_zeros(word))
+                word &= word - np.uint64(1)
+                row = blocks.rows[block, 64 * z + bit]
+                for claim in range(2):
+                    label = patches.second[row] if claim else patches.label[row]
+                    if label < 0:
+                        continue
+                    n = label >> 4
+                    x, y, w = i + n % 3 - 1, j + (n // 3) % 3 - 1, k + n // 9 - 1
+                    if x >> 3 != ti or y >> 3 != tj or w >> 3 != tk:
+                        continue
+                    other = block if n == CENTRE else blocks.neighbours[block, n]
+                    rows[count] = row
+                    owner[count] = plane_of_patch[other, label & 15]
+                    corner[count] = claim == 1
+                    count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def shell(table_keys, table_values, tile_key, out):  # type: ignore[no-untyped-def]
+    """Existing blocks of a tile and of the one-block shell round it, by ascending key."""
+    ti, tj, tk = unpack(tile_key)
+    count = 0
+    for i in range(8 * ti - 1, 8 * ti + 9):
+        for j in range(8 * tj - 1, 8 * tj + 9):
+            for k in range(8 * tk - 1, 8 * tk + 9):
+                block = find(table_keys, table_values, pack(i, j, k))
+                if block >= 0:
+                    out[count] = block
+                    count += 1
+    return count
+
+
+@njit(cache=True, nogil=True)
+def inherit(old_rows, old_owner, old_corner, rows, owner, corner, scratch, counts):  # type: ignore[no-untyped-def]
+    """counts[old, new]: voxels that went from one tile-plane to another. scratch (V,) stays 0."""
+    for m in range(old_rows.shape[0]):
+        if not old_corner[m]:
+            scratch[old_rows[m]] = old_owner[m] + 1
+    for m in range(rows.shape[0]):
+        if not corner[m] and scratch[rows[m]] > 0:
+            counts[scratch[rows[m]] - 1, owner[m]] += 1
+    for m in range(old_rows.shape[0]):
+        scratch[old_rows[m]] = 0
