@@ -49,7 +49,7 @@ def limits(settings: MapSettings, sigma: float, angle_deg: float | None = None) 
         cos=math.cos(math.radians(angle_deg or settings.merge_angle_deg)),
         offset=offset,
         cross=min(settings.cross_sigmas * sigma, offset),
-        variance=(settings.max_merged_sigma_m / settings.voxel_m) ** 2,
+        variance=settings.max_merged_sigma**2,
         bridge=math.radians(settings.bridge_angle_deg),
         tilt=settings.tilt_offset,
     )

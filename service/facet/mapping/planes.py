@@ -100,6 +100,7 @@ def group_planes(
     stages = Stages(seeds=len(table.nodes.votes))
     roots, merged = merge_nodes(table.nodes, table.edges, limit)
     label, nodes = _relabel(roots, merged)
+    label, nodes = _drop(label, nodes, nodes.votes >= settings.n_min)  # less makes no plane
     occupation = _occupation(label, table, len(nodes.votes))
     stages.merged = len(nodes.votes)
     stages.average_sigma = _average_sigma(nodes)

@@ -55,7 +55,7 @@ class MapSettings:
     tilt_offset: float = 0.25
     cross_sigmas: float = 1.0  # between planes that do not touch
     merge_sigmas: float = 3.0
-    max_merged_sigma_m: float = 0.025
+    max_merged_sigma: float = 0.5
     min_area_m2: float = 0.25  # n_occ is never above this many square metres of voxels
     min_width: float = 2.5  # a narrower strip has no normal of its own
     strip_width: float = 24.0  # a narrower plane is a strip, which must not be bent
