@@ -158,8 +158,10 @@ def _check_planes(mapper: Mapper) -> None:
     for plane in planes:
         voxels = int(table.occupation[ids == plane.id].sum())
         assert voxels == plane.num_voxels, f"plane {plane.id} has {voxels} voxels"
-        num = points.get(plane.id, 0)
+        num = int(table.total[ids == plane.id].sum())
         assert num == plane.num_points > 0, f"plane {plane.id} has {num} points"
+        least, most = points.get(plane.id, (0, 0))
+        assert least <= num <= most, f"plane {plane.id}: {num} points in voxels of {most}"
     shown = [points.plane_ids for points in mapper.points()]
     known = {0, *(p.id for p in planes)}
     assert known.issuperset(np.concatenate([[0], *shown]).tolist()), "a voxel shows an unknown id"
@@ -167,17 +169,19 @@ def _check_planes(mapper: Mapper) -> None:
     assert sum(map(len, shown)) == voxels, "not every voxel is shown once"
 
 
-def _points_by_plane(mapper: Mapper) -> dict[int, int]:
-    """Points of the members (not the leftovers) of each plane, from the voxels."""
+def _points_by_plane(mapper: Mapper) -> dict[int, tuple[int, int]]:
+    """Points of each plane's members, and of all its voxels."""
     store, patches = mapper._store, mapper._patches.patches
-    total: dict[int, int] = {}
+    total: dict[int, tuple[int, int]] = {}
     for tile in mapper._tiles.tiles.values():
-        own = tile.rows[~tile.corner]
-        member = patches.member[own] >= 0
-        sums = np.zeros(tile.num_planes, np.int64)
-        np.add.at(sums, tile.owner[~tile.corner][member], store.columns.moments[own[member], 0])
-        for plane_id, points in zip(tile.ids.tolist(), sums.tolist(), strict=False):
-            total[plane_id] = total.get(plane_id, 0) + points
+        own, owner = tile.rows[~tile.corner], tile.owner[~tile.corner]
+        sums = np.zeros((tile.num_planes, 2), np.int64)
+        points = store.columns.moments[own, 0]
+        np.add.at(sums[:, 0], owner, np.where(patches.member[own] >= 0, points, 0))
+        np.add.at(sums[:, 1], owner, points)
+        for plane_id, (members, voxels) in zip(tile.ids.tolist(), sums.tolist(), strict=False):
+            least, most = total.get(plane_id, (0, 0))
+            total[plane_id] = least + members, most + voxels
     return total
 
 
