@@ -5,7 +5,7 @@ from __future__ import annotations
 import itertools
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
@@ -28,6 +28,7 @@ def test_every_box_of_an_8_by_8_slice() -> None:
         assert int(box_mask(x0, x1, y0, y1)) == plain
 
 
+@settings(deadline=None)
 @given(st.integers(1, 2**64 - 1))
 def test_bits_are_found_lowest_first(word: int) -> None:
     expected = [b for b in range(64) if word >> b & 1]

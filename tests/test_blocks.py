@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from facet.mapping.blocks import (
@@ -27,6 +27,7 @@ index = st.integers(-OFFSET, OFFSET - 1)
 triple = st.tuples(index, index, index)
 
 
+@settings(deadline=None)
 @given(triple)
 def test_unpack_is_the_inverse_of_pack(ijk: tuple[int, int, int]) -> None:
     key = pack(*ijk)
@@ -34,6 +35,7 @@ def test_unpack_is_the_inverse_of_pack(ijk: tuple[int, int, int]) -> None:
     assert key >= 0
 
 
+@settings(deadline=None)
 @given(st.lists(triple, max_size=20))
 def test_arrays_pack_as_single_indices_do(many: list[tuple[int, int, int]]) -> None:
     ijk = np.array(many, np.int64).reshape(-1, 3)
@@ -42,16 +44,19 @@ def test_arrays_pack_as_single_indices_do(many: list[tuple[int, int, int]]) -> N
     np.testing.assert_array_equal(unpack_all(keys), ijk)
 
 
+@settings(deadline=None)
 @given(triple, triple)
 def test_keys_sort_as_indices_do(a: tuple[int, int, int], b: tuple[int, int, int]) -> None:
     assert (pack(*a) < pack(*b)) == (a < b)
 
 
+@settings(deadline=None)
 @given(triple)
 def test_a_hash_is_not_negative(ijk: tuple[int, int, int]) -> None:
     assert hash_key(pack(*ijk)) >= 0
 
 
+@settings(deadline=None)
 @given(st.sets(triple, max_size=60))
 def test_the_table_finds_what_was_put_and_nothing_else(many: set[tuple[int, int, int]]) -> None:
     ordered = sorted(many)
@@ -92,6 +97,7 @@ def test_a_block_has_27_different_neighbours(shift: int) -> None:
         assert unpack(keys[block]) == tuple(shift // 8 + o for o in offset)
 
 
+@settings(deadline=None)
 @given(st.integers(0, 2**31), st.integers(1, 400))
 def test_neighbour_links_agree_with_keys(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -42,6 +42,7 @@ vectors = st.lists(st.floats(-1, 1), min_size=3, max_size=3).filter(
 )
 
 
+@settings(deadline=None)
 @given(vectors, st.floats(-20, 20), st.sampled_from([-1.0, 1.0]))
 def test_d_is_never_negative_and_facing_keeps_the_side(
     normal: list[float], offset: float, side: float
@@ -106,6 +107,7 @@ def test_the_covariance_is_that_of_many_fits() -> None:
     np.testing.assert_allclose(told / scale, measured / scale, atol=0.12)
 
 
+@settings(deadline=None)
 @given(vectors, st.floats(-9, 9))
 def test_a_covariance_is_symmetric_and_moves_no_unit_normal_along_itself(
     normal: list[float], offset: float

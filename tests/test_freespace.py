@@ -34,8 +34,8 @@ def cells_of(free: FreeSpace) -> dict[tuple[int, ...], int]:
     return {tuple(c): int(n) for c, n in zip(unpack_all(keys).tolist(), counts, strict=True)}
 
 
-def stays(a: Points, b: Points) -> dict[tuple[int, ...], float]:
-    """Cells that the straight line a -> b goes through, and for how many ticks of its way."""
+def entered(a: Points, b: Points) -> set[tuple[int, ...]]:
+    """Cells that the straight line a -> b enters by two ticks and more."""
     step = (b - a).astype(float)
     at = [0.0, 1.0]
     for axis in range(3):
@@ -45,11 +45,13 @@ def stays(a: Points, b: Points) -> dict[tuple[int, ...], float]:
             cut = (borders - a[axis]) / step[axis]
             at.extend(cut[(cut > 0.0) & (cut < 1.0)].tolist())
     at.sort()
-    told: dict[tuple[int, ...], float] = {}
+    told = set()
     for s, t in pairwise(at):
-        middle = np.floor((a + 0.5 * (s + t) * step) / (1 << SHIFT)).astype(int)
-        key = tuple(middle.tolist())
-        told[key] = told.get(key, 0.0) + (t - s) * float(np.abs(step).max())
+        middle = a + 0.5 * (s + t) * step
+        cell = np.floor(middle / (1 << SHIFT)).astype(int)
+        depth = np.minimum(middle - (cell << SHIFT), ((cell + 1) << SHIFT) - middle)
+        if depth.min() >= 2.0:
+            told.add(tuple(cell.tolist()))
     return told
 
 
@@ -69,7 +71,7 @@ def test_a_beam_counts_the_cells_on_its_way_once(a: tuple[int, ...], b: tuple[in
     free.insert(ticks_of(a, beams=[b]))
     found, start, stop = cells_of(free), np.array(a), np.array(b)
     assert set(found.values()) == {1}
-    must = {cell for cell, ticks in stays(start, stop).items() if ticks > 4.0}
+    must = entered(start, stop)
     assert must <= found.keys()
     spacing = np.abs(stop - start).max() / 4000 + 2.0
     assert all(distance(c, start, stop) <= spacing for c in found.keys() - must)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from facet.mapping.identity import Heritage, Identity, Lineage
@@ -97,6 +97,7 @@ def test_events_are_numbered_without_a_gap() -> None:
     assert numbers == list(range(1, len(numbers) + 1))
 
 
+@settings(deadline=None)
 @given(st.data())
 def test_ids_are_never_used_twice(data: st.DataObject) -> None:
     """Planes come, go, merge and split at random."""

@@ -107,7 +107,6 @@ def test_a_handful_of_points_is_hardly_a_surface() -> None:
     assert area < 0.5
 
 
-@pytest.mark.xfail(strict=True, reason="where all planes are tiny the detail level keeps them all")
 def test_every_plane_owns_a_surface() -> None:
     """design 3.4: it owns one or more surfaces."""
     assert all(p.surfaces for p in clutter().snapshot().changed)

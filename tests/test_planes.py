@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from facet.mapping.mapper import Mapper
@@ -28,6 +28,7 @@ def test_the_detail_level_of_method_10_7() -> None:
         assert reached == pytest.approx(0.98)
 
 
+@settings(deadline=None)
 @given(counts, st.floats(0.5, 1.0))
 def test_the_kept_planes_are_the_fewest_that_reach_the_level(many: list[int], level: float) -> None:
     occupation = np.array(many)
@@ -41,6 +42,7 @@ def test_the_kept_planes_are_the_fewest_that_reach_the_level(many: list[int], le
     assert larger / total < level + 1e-9  # without the last size it would not be enough
 
 
+@settings(deadline=None)
 @given(counts)
 def test_everything_is_kept_at_a_detail_level_of_one(many: list[int]) -> None:
     keep, least, reached = detail_level(np.array(many), replace(UNBOUND, detail_level=1.0))
@@ -48,6 +50,7 @@ def test_everything_is_kept_at_a_detail_level_of_one(many: list[int]) -> None:
     assert (least, reached) == (min(many), 1.0)
 
 
+@settings(deadline=None)
 @given(counts)
 def test_a_large_enough_plane_is_never_dropped(many: list[int]) -> None:
     """A new room drops nothing elsewhere: 0.25 m^2 are 100 voxels of 5 cm."""

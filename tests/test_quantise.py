@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
@@ -35,6 +35,7 @@ def test_ticks_are_floors_also_below_zero() -> None:
     assert found[0, 0] & 1023 == 1022
 
 
+@settings(deadline=None)
 @given(hnp.arrays(np.float32, (7, 3), elements=st.floats(-70, 70, width=32)))
 def test_ticks_agree_with_exact_floors(points: np.ndarray) -> None:
     """The pose is the identity and ticks are powers of two: nothing is rounded before."""
@@ -44,6 +45,7 @@ def test_ticks_agree_with_exact_floors(points: np.ndarray) -> None:
     np.testing.assert_array_equal(ticks.points, np.floor(kept / TICK).astype(np.int64))
 
 
+@settings(deadline=None)
 @given(hnp.arrays(np.float32, st.tuples(st.integers(0, 30), st.just(3)), elements=numbers))
 def test_every_point_is_stored_or_rejected_for_one_reason(points: np.ndarray) -> None:
     ticks = quantise(scan_of(points), SETTINGS)
@@ -126,6 +128,7 @@ def test_line_scans_carry_a_hash_of_their_pose() -> None:
     assert quantise(replace(line, pose=turned), SETTINGS).pose_hash not in hashes
 
 
+@settings(deadline=None)
 @given(st.lists(st.floats(-1, 1), min_size=4, max_size=4).filter(lambda q: np.linalg.norm(q) > 0.1))
 def test_a_rotation_is_orthonormal(q: list[float]) -> None:
     xyzw = np.array(q) / np.linalg.norm(q)

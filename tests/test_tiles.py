@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from facet.mapping.blocks import pack, pack_all, unpack
@@ -14,6 +14,7 @@ index = st.integers(-9000, 9000)
 blocks = st.lists(st.tuples(index, index, index), min_size=1, max_size=20)
 
 
+@settings(deadline=None)
 @given(blocks)
 def test_a_block_lies_in_one_tile(many: list[tuple[int, int, int]]) -> None:
     keys = pack_all(np.array(many, np.int64))
@@ -21,6 +22,7 @@ def test_a_block_lies_in_one_tile(many: list[tuple[int, int, int]]) -> None:
     assert tile_keys_of(keys).tolist() == expected
 
 
+@settings(deadline=None)
 @given(blocks, blocks)
 def test_what_moved_is_told_to_all_tiles_that_may_name_it(
     tiles: list[tuple[int, int, int]], many: list[tuple[int, int, int]]

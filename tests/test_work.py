@@ -63,7 +63,7 @@ def checks_late_work(mapper: Mapper, told: list[dict[str, int]]) -> None:
         "blocks_regrouped": 0.10,
         "blocks_relabelled": 0.12,
         "tiles_changed": 0.50,
-        "outline_tiles": 0.35,
+        "outline_tiles": 0.50,
     }
     for name, limit in limits.items():
         assert shares[name] <= limit, f"{name}: {shares[name]:.2f} of the map at every update"
