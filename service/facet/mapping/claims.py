@@ -9,118 +9,211 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from facet.mapping.blocks import CENTRE
+from facet.mapping.blocks import CENTRE, find, pack, unpack
 
 LEFTOVER_REACH = 8  # voxels between a leftover and the box of the patch it joins
+CLAIM_REACH = 2  # voxels between a corner voxel and the box of a patch that claims it too
+PARALLEL_COS = 0.98
+REACH_BLOCKS = 2  # a label depends on patches so many blocks away
 CORNER_COS = 0.8  # planes that share a corner voxel differ by more than 37 degrees
 
 
 @njit(cache=True, nogil=True)
-def _candidates(blocks, patches, block, codes, planes, boxes):  # type: ignore[no-untyped-def]
-    """Patches of a block and its 26 neighbours: label, plane (unit normal, offset, weight of its
-    size) and box, in eighths from the block's own corner. Returns how many."""
-    count = 0
-    for n in range(27):
-        other = block if n == CENTRE else blocks.neighbours[block, n]
-        if other < 0:
-            continue
-        shift = (64 * (n % 3 - 1), 64 * ((n // 3) % 3 - 1), 64 * (n // 9 - 1))
-        for p in range(patches.number[other]):
-            if count == codes.shape[0]:
-                return count
-            unit, votes = patches.unit[other, p], float(patches.votes[other, p])
-            ux, uy, uz = float(unit[0]), float(unit[1]), float(unit[2])
-            length = np.sqrt(ux * ux + uy * uy + uz * uz)
-            offset = 0.0
-            for a in range(3):
-                planes[count, a] = unit[a] / length
-                middle = patches.centroid[other, p, a] / votes + shift[a]
-                offset += planes[count, a] * middle
-                boxes[count, a] = 8 * np.int64(patches.box[other, p, a]) + shift[a]
-                boxes[count, a + 3] = 8 * np.int64(patches.box[other, p, a + 3]) + 8 + shift[a]
-            planes[count, 3] = offset
-            planes[count, 4] = 1.0 / (1.0 + votes)
-            codes[count] = 16 * n + p
-            count += 1
+def _add_candidates(patches, other, code, shift, count, codes, planes, boxes):  # type: ignore[no-untyped-def]
+    """Append the patches of block `other`: label, plane (unit normal, offset, weight of its size)
+    and box, in eighths from the corner of the block that asks. Returns how many there are now."""
+    for p in range(patches.number[other]):
+        if count == codes.shape[0]:
+            break
+        unit, votes = patches.unit[other, p], float(patches.votes[other, p])
+        ux, uy, uz = float(unit[0]), float(unit[1]), float(unit[2])
+        length = np.sqrt(ux * ux + uy * uy + uz * uz)
+        offset = 0.0
+        for a in range(3):
+            planes[count, a] = unit[a] / length
+            middle = patches.centroid[other, p, a] / votes + shift[a]
+            offset += planes[count, a] * middle
+            boxes[count, a] = 8 * np.int64(patches.box[other, p, a]) + shift[a]
+            boxes[count, a + 3] = 8 * np.int64(patches.box[other, p, a + 3]) + 8 + shift[a]
+        planes[count, 3] = offset
+        planes[count, 4] = 1.0 / (1.0 + votes)
+        codes[count] = code + p
+        count += 1
     return count
 
 
 @njit(cache=True, nogil=True)
-def _nearest(planes, boxes, count, local, seen, tolerance, avoid):  # type: ignore[no-untyped-def]
-    """Candidate that suits a voxel best, none within 37 degrees of candidate `avoid`; -1: none.
-    It must face the voxel's sensor, its plane must be near, and so must its box."""
-    c0 = 8 * (local & 7) + (seen & 15)
-    c1 = 8 * ((local >> 3) & 7) + ((seen >> 4) & 15)
-    c2 = 8 * (local >> 6) + ((seen >> 8) & 15)
+def _near_candidates(blocks, patches, block, codes, planes, boxes):  # type: ignore[no-untyped-def]
+    """Patches of a block and its 26 neighbours."""
+    count = 0
+    for n in range(27):
+        other = block if n == CENTRE else blocks.neighbours[block, n]
+        if other >= 0:
+            shift = (64 * (n % 3 - 1), 64 * ((n // 3) % 3 - 1), 64 * (n // 9 - 1))
+            count = _add_candidates(patches, other, 16 * n, shift, count, codes, planes, boxes)
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _far_candidates(blocks, patches, block, count, codes, planes, boxes):  # type: ignore[no-untyped-def]
+    """Append the patches of the blocks two away: the other jamb of a door."""
+    i, j, k = unpack(blocks.keys[block])
+    for n in range(125):
+        di, dj, dk = n % 5 - 2, (n // 5) % 5 - 2, n // 25 - 2
+        if max(abs(di), abs(dj), abs(dk)) < 2:
+            continue
+        other = find(blocks.table_keys, blocks.table_values, pack(i + di, j + dj, k + dk))
+        if other >= 0:
+            shift = (64 * di, 64 * dj, 64 * dk)
+            count = _add_candidates(patches, other, 0, shift, count, codes, planes, boxes)
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _place(local, seen):  # type: ignore[no-untyped-def]
+    """A voxel's rounded centroid, eighths from the block corner."""
+    return (
+        8 * (local & 7) + (seen & 15),
+        8 * ((local >> 3) & 7) + ((seen >> 4) & 15),
+        8 * (local >> 6) + ((seen >> 8) & 15),
+    )
+
+
+@njit(cache=True, nogil=True)
+def _off(planes, q, c):  # type: ignore[no-untyped-def]
+    """Distance of a place from a candidate's plane."""
+    return abs(planes[q, 0] * c[0] + planes[q, 1] * c[1] + planes[q, 2] * c[2] - planes[q, 3])
+
+
+@njit(cache=True, nogil=True)
+def _dot(planes, q, o):  # type: ignore[no-untyped-def]
+    return planes[q, 0] * planes[o, 0] + planes[q, 1] * planes[o, 1] + planes[q, 2] * planes[o, 2]
+
+
+@njit(cache=True, nogil=True)
+def _beside(boxes, q, c, axis):  # type: ignore[no-untyped-def]
+    """Signed way from a place to a candidate's box along an axis; 0 within it."""
+    if c[axis] < boxes[q, axis]:
+        return boxes[q, axis] - c[axis]
+    return min(0, boxes[q, axis + 3] - c[axis])
+
+
+@njit(cache=True, nogil=True)
+def _gap(boxes, q, c):  # type: ignore[no-untyped-def]
+    """Chebyshev distance of a place from a candidate's box."""
+    return max(
+        abs(_beside(boxes, q, c, 0)), abs(_beside(boxes, q, c, 1)), abs(_beside(boxes, q, c, 2))
+    )
+
+
+@njit(cache=True, nogil=True)
+def _join(planes, boxes, count, local, seen, tolerance):  # type: ignore[no-untyped-def]
+    """Candidate that a leftover joins, -1: none. It must face the voxel's sensor, its plane must
+    be near, and so must its box."""
+    c = _place(local, seen)
     v0, v1, v2 = ((seen >> 16) & 31) - 8, ((seen >> 21) & 31) - 8, ((seen >> 26) & 31) - 8
     mixed = ((seen >> 31) & 1) == 1
     best, best_cost = -1, np.inf
     for q in range(count):
-        u = planes[q]
-        w = abs(u[0] * c0 + u[1] * c1 + u[2] * c2 - u[3])
+        w = _off(planes, q, c)
         if w > tolerance:
             continue
-        if avoid < 0:
-            if not mixed and u[0] * v0 + u[1] * v1 + u[2] * v2 <= 0.0:
-                continue
-        else:  # whoever claims a corner need not be seen from the same side
-            o = planes[avoid]
-            if u[0] * o[0] + u[1] * o[1] + u[2] * o[2] > CORNER_COS:
-                continue
-        box = boxes[q]
-        gap = max(0, box[0] - c0, c0 - box[3], box[1] - c1, c1 - box[4], box[2] - c2, c2 - box[5])
+        if not mixed and planes[q, 0] * v0 + planes[q, 1] * v1 + planes[q, 2] * v2 <= 0.0:
+            continue
+        gap = _gap(boxes, q, c)
         if gap > 8 * LEFTOVER_REACH:
             continue
-        cost = (w / tolerance) ** 2 + (gap / (8.0 * LEFTOVER_REACH)) ** 2 + u[4]
+        cost = (w / tolerance) ** 2 + (gap / (8.0 * LEFTOVER_REACH)) ** 2 + planes[q, 4]
         if cost < best_cost:
             best, best_cost = q, cost
     return best
 
 
 @njit(cache=True, nogil=True)
+def _bridged(planes, boxes, count, q, c, tolerance):  # type: ignore[no-untyped-def]
+    """Whether a place lies between candidate q and another of the same plane: on a threshold."""
+    x, y, z = _beside(boxes, q, c, 0), _beside(boxes, q, c, 1), _beside(boxes, q, c, 2)
+    for o in range(count):
+        if o == q or _dot(planes, q, o) < PARALLEL_COS or _off(planes, o, c) > tolerance:
+            continue
+        ox, oy, oz = _beside(boxes, o, c, 0), _beside(boxes, o, c, 1), _beside(boxes, o, c, 2)
+        dot = float(x * ox + y * oy + z * oz)
+        lengths = float(x * x + y * y + z * z) * float(ox * ox + oy * oy + oz * oz)
+        if dot < 0.0 and dot * dot > 0.5 * lengths:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True)
+def _claim(planes, boxes, near, count, c, tolerance, own):  # type: ignore[no-untyped-def]
+    """Candidate of the first `near`, at an angle to `own`, that claims a place as a corner, or as
+    a threshold with the help of any of the `count`.
+
+    Returns (candidate, -1: none; whether one was left out for want of the other jamb)."""
+    best, best_cost, alone = -1, np.inf, False
+    for q in range(near):
+        if _dot(planes, q, own) > CORNER_COS:
+            continue
+        w = _off(planes, q, c)
+        if w > tolerance:
+            continue
+        gap = _gap(boxes, q, c)
+        if gap > 8 * CLAIM_REACH and not _bridged(planes, boxes, count, q, c, tolerance):
+            alone = True
+            continue
+        cost = (w / tolerance) ** 2 + (gap / (8.0 * LEFTOVER_REACH)) ** 2 + planes[q, 4]
+        if cost < best_cost:
+            best, best_cost = q, cost
+    return best, alone
+
+
+@njit(cache=True, nogil=True)
 def _flat(planes, count):  # type: ignore[no-untyped-def]
     """Whether all candidates look the same way: then there is no corner."""
-    for q in range(1, count):
-        if (
-            planes[q, 0] * planes[0, 0] + planes[q, 1] * planes[0, 1] + planes[q, 2] * planes[0, 2]
-            < 0.98
-        ):
+    for q in range(1, count):  # noqa: SIM110 numba has no all() of a generator
+        if _dot(planes, q, 0) < PARALLEL_COS:
             return False
     return True
 
 
 @njit(cache=True, nogil=True)
-def label_blocks(blocks, observable, patches, which, grouping, changed):  # type: ignore[no-untyped-def]
-    """Label every voxel of the blocks `which` again; mark the blocks where a label changed."""
-    most = 27 * patches.votes.shape[1]
+def label_blocks(blocks, observable, patches, which, tolerance, changed):  # type: ignore[no-untyped-def]
+    """Label every voxel of the blocks `which` again; mark the blocks where a label changed.
+
+    Reads the patches of the blocks up to two away (REACH_BLOCKS)."""
+    most = 125 * patches.votes.shape[1]
     codes = np.empty(most, np.int16)
     planes = np.empty((most, 5))
     boxes = np.empty((most, 6), np.int64)
     for q in range(which.shape[0]):
         block = which[q]
-        count = _candidates(blocks, patches, block, codes, planes, boxes)
-        flat = _flat(planes, count)
+        near = _near_candidates(blocks, patches, block, codes, planes, boxes)
+        count = near
+        flat = _flat(planes, near)
         for local in range(512):
             row = blocks.rows[block, local]
             if row < 0:
                 continue
             seen = observable[row]
-            label, second = -1, -1
+            label, second, own = -1, -1, -1
             if seen != 0:
-                own = -1
                 if patches.member[row] >= 0:
                     label = 16 * CENTRE + patches.member[row]
-                    for o in range(count):
+                    for o in range(near):
                         if codes[o] == label:
                             own = o
                 else:
-                    own = _nearest(planes, boxes, count, local, seen, grouping.leftover, -1)
+                    own = _join(planes, boxes, near, local, seen, tolerance)
                     if own >= 0:
                         label = codes[own]
-                if own >= 0 and not flat:
-                    other = _nearest(planes, boxes, count, local, seen, grouping.leftover, own)
-                    if other >= 0:
-                        second = codes[other]
+            if own >= 0 and not flat:
+                c = _place(local, seen)
+                other, alone = _claim(planes, boxes, near, count, c, tolerance, own)
+                if alone and count == near:
+                    count = _far_candidates(blocks, patches, block, near, codes, planes, boxes)
+                    other, alone = _claim(planes, boxes, near, count, c, tolerance, own)
+                if other >= 0:
+                    second = codes[other]
             if patches.label[row] != label or patches.second[row] != second:
                 patches.label[row] = label
                 patches.second[row] = second

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from facet.mapping.bits import trailing_zeros
 from facet.mapping.blocks import CENTRE
-from facet.mapping.claims import label_blocks
+from facet.mapping.claims import REACH_BLOCKS, label_blocks
 from facet.mapping.eigen import smallest
 from facet.mapping.normals import VALID, Normals
 from facet.mapping.settings import STEPS, TICKS, MapSettings
@@ -323,10 +323,19 @@ class PatchField:
         regrouped = dirty[changed]
         near = np.empty(store.num_blocks, np.int32)
         count = _dilate(store.blocks, regrouped, self._flags, near)
+        for _ in range(REACH_BLOCKS - 1):
+            wider = np.empty(store.num_blocks, np.int32)
+            more = _dilate(store.blocks, near[:count], self._flags, wider)
+            near, count = wider, more
         near = np.union1d(near[:count], dirty)
         relabelled = np.zeros(len(near), np.bool_)
         label_blocks(
-            store.blocks, store.columns.observable, self.patches, near, self._grouping, relabelled
+            store.blocks,
+            store.columns.observable,
+            self.patches,
+            near,
+            self._grouping.leftover,
+            relabelled,
         )
         relabelled_blocks = near[relabelled]
         touched = np.union1d(block_of[touched_rows], np.union1d(dirty, relabelled_blocks))
