@@ -135,6 +135,7 @@ def judge(case: Case, mapped: Mapped, scored: Score) -> list[Figure]:
         at_most(f"{name}: points to contours (paper {paper_s:g} s)", mapped.seconds, LIMIT_S, "s"),
         Figure(f"{name}: surfaces found", surfaces),
         Figure(f"{name}: planes (truth {scored.truth_planes})", scored.planes),
+        Figure(f"{name}: splits, merges", f"{len(scored.splits)}, {len(scored.merges)}"),
         Figure(f"{name}: area recall", scored.area_recall),
         Figure(f"{name}: area precision", scored.area_precision),
     ]
