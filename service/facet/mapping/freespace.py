@@ -13,7 +13,7 @@ from facet.mapping.settings import TICKS
 CELL = 4  # voxels per cell edge
 SHIFT = 12  # ticks to cells: 2^12 = CELL * TICKS
 BEAMS_OF = 8  # of a cloud's beams one in so many is followed, chosen by a hash of its end
-MOST_BLOCKS = 2048  # blocks that one beam can add at the most
+FIRST_BLOCKS = 1024  # capacity to begin with
 
 assert 1 << SHIFT == CELL * TICKS
 
@@ -65,6 +65,16 @@ def _pass(table, counts, keys, num_blocks, a, b, sign, ends):  # type: ignore[no
 
 
 @njit(cache=True, nogil=True)
+def _blocks_apart(a, b):  # type: ignore[no-untyped-def]
+    """Blocks between two points (ticks), axis by axis."""
+    shift = SHIFT + 3
+    total = 0
+    for axis in range(3):
+        total += abs((a[axis] >> shift) - (b[axis] >> shift))
+    return total
+
+
+@njit(cache=True, nogil=True)
 def _pass_all(table, counts, keys, num_blocks, sensor, points, start, every, sign, ends):  # type: ignore[no-untyped-def]
     """Follow the chosen beams from `start` on. Returns (next beam, number of blocks)."""
     for p in range(start, points.shape[0]):
@@ -73,7 +83,8 @@ def _pass_all(table, counts, keys, num_blocks, sensor, points, start, every, sig
         )
         if every > 1 and mixed % every != 0:
             continue
-        if num_blocks + MOST_BLOCKS > counts.shape[0]:
+        most = 3 + _blocks_apart(sensor, points[p])  # that this beam can add
+        if num_blocks + most > counts.shape[0]:
             return p, num_blocks
         num_blocks = _pass(table, counts, keys, num_blocks, sensor, points[p], sign, ends)
     return points.shape[0], num_blocks
@@ -95,9 +106,9 @@ class FreeSpace:
     """Beam counts by cell of 4 voxels, in dense blocks of 8^3 cells."""
 
     def __init__(self) -> None:
-        self._keys = np.zeros(2 * MOST_BLOCKS, np.int64)
-        self._counts = np.zeros((2 * MOST_BLOCKS, 512), np.int32)
-        self._table = rehash(self._keys, 0, 8 * MOST_BLOCKS)
+        self._keys = np.zeros(FIRST_BLOCKS, np.int64)
+        self._counts = np.zeros((FIRST_BLOCKS, 512), np.int32)
+        self._table = rehash(self._keys, 0, 4 * FIRST_BLOCKS)
         self.num_blocks = 0
 
     def insert(self, ticks: Ticks) -> None:

@@ -101,9 +101,32 @@ def stitch(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
             done[e] = True
             chain.append(e)
             e = int(follow[e])
-        if e == first and len(chain) > 2:
-            rings.append(edges[chain, :2])
-    return rings
+        if e == first:
+            rings.extend(_simple_rings(edges[chain, :2], start[chain]))
+    return sorted(rings, key=lambda ring: tuple(ring[0]))
+
+
+def _simple_rings(ring: NDArray[np.int64], keys: NDArray[np.int64]) -> list[NDArray[np.int64]]:
+    """A ring split where it comes back to a vertex, so that none touches itself. Signed areas add
+    up to that of the whole. keys: (M,) of the vertices, ascending by (u, v)."""
+    rings, path = [], list[int]()
+    place: dict[int, int] = {}
+    for index, key in enumerate(keys.tolist()):
+        if key in place:
+            begin = place[key]
+            rings.append(path[begin:])
+            for dropped in path[begin:]:
+                del place[int(keys[dropped])]
+            path = path[:begin]
+        place[key] = len(path)
+        path.append(index)
+    rings.append(path)
+    simple = []
+    for chain in rings:
+        if len(chain) > 2:
+            first = int(np.argmin(keys[chain]))
+            simple.append(ring[np.roll(chain, -first)])
+    return simple
 
 
 def signed_area(ring: NDArray[np.int64] | NDArray[np.int32]) -> float:
