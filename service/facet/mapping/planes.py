@@ -152,7 +152,8 @@ def _drop(
     label: NDArray[np.int64], nodes: Nodes, keep: NDArray[np.bool_]
 ) -> tuple[NDArray[np.int64], Nodes]:
     new = np.where(keep, np.cumsum(keep) - 1, FREE)
-    return new[label] if len(new) else label, Nodes(*(np.ascontiguousarray(c[keep]) for c in nodes))
+    label = np.where(label == FREE, FREE, new[label]) if len(new) else label
+    return label, Nodes(*(np.ascontiguousarray(c[keep]) for c in nodes))
 
 
 def _occupation(label: NDArray[np.int64], table: Table, count: int) -> NDArray[np.int64]:
