@@ -50,7 +50,7 @@ def tiled(points: Grid) -> Grid:
     """(E, 4) edges found tile by tile, each with its halo only."""
     parts = [np.zeros((0, 4), np.int64)]
     for place in np.unique(points // SIZE, axis=0).tolist():
-        edges = boundary_edges(window_of(points, tuple(place))).astype(np.int64)
+        edges = boundary_edges(window_of(points, tuple(place))[None])[0].astype(np.int64)
         parts.append(edges + np.tile(np.array(place) * SIZE, 2))
     return np.concatenate(parts)
 

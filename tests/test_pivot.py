@@ -17,7 +17,7 @@ from facet.mapping.settings import ALPHA2
 @pytest.mark.parametrize("hole", [0, 80])
 def test_a_tile_has_the_edges_of_the_alpha_complex(count: int, hole: int) -> None:
     points = scattered(count + hole, count, SIZE, hole)
-    edges = boundary_edges(window_of(points, (0, 0))).astype(np.int64)
+    edges = boundary_edges(window_of(points, (0, 0))[None])[0].astype(np.int64)
     assert regular(edges) == boundary(points)[0]
 
 
@@ -51,7 +51,7 @@ def test_the_alpha_radius_hits_no_grid_triangle() -> None:
 @pytest.mark.parametrize("points", [[], [(5, 5)], [(5, 5), (20, 9)], [(5, 5), (5, 5 + 81)]])
 def test_too_few_points_enclose_nothing(points: list[tuple[int, int]]) -> None:
     rows = np.array(points, np.int64).reshape(-1, 2)
-    assert regular(boundary_edges(window_of(rows, (0, 0))).astype(np.int64)) == []
+    assert regular(boundary_edges(window_of(rows, (0, 0))[None])[0].astype(np.int64)) == []
 
 
 def test_a_triangle_is_kept_up_to_alpha() -> None:
@@ -60,6 +60,6 @@ def test_a_triangle_is_kept_up_to_alpha() -> None:
     for length, kept in ((int(side) - 2, True), (int(side) + 3, False)):
         tip = (length // 2 + 100, 100 + round(length * math.sqrt(3) / 2))
         points = np.array([(100, 100), (100 + length, 100), tip], np.int64)
-        edges = regular(boundary_edges(window_of(points, (0, 0))).astype(np.int64))
+        edges = regular(boundary_edges(window_of(points, (0, 0))[None])[0].astype(np.int64))
         assert len(edges) == (3 if kept else 0)
         assert edges == boundary(points)[0]

@@ -10,14 +10,11 @@ from benchmarks.real import PLACES, Found, find, map_place
 from facet.mapping.settings import MapSettings
 
 LIMITS = {"corridor": 120, "rooms": None, "panels": None}  # scans
-SWALLOWED = pytest.mark.xfail(
-    strict=False, reason="what the minimum of voxels frees is given to the last plane"
-)
 EXPECTED = (
     ("corridor", "floor"),
     ("rooms", "floor"),
     ("rooms", "ceiling"),
-    pytest.param("panels", "panel 1", marks=SWALLOWED),
+    ("panels", "panel 1"),
     ("panels", "panel 2"),
     ("panels", "panel 3"),
 )
@@ -40,7 +37,6 @@ def test_a_known_plane_is_found(place: str, name: str) -> None:
     assert got.angle_deg <= 2.0
 
 
-@SWALLOWED
 def test_panels_are_planes_of_their_own() -> None:
     planes = [found("panels")[f"panel {k}"].plane for k in (1, 2, 3)]
     assert len({plane.id for plane in planes if plane is not None}) == 3

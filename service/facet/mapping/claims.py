@@ -7,13 +7,14 @@ its fate. A voxel at a corner lies on two planes: the second may use it as a ver
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 
 from facet.mapping.blocks import CENTRE, find, pack, unpack
 
 LEFTOVER_REACH = 8  # voxels between a leftover and the box of the patch it joins
 CLAIM_REACH = 2  # voxels between a corner voxel and the box of a patch that claims it too
 PARALLEL_COS = 0.98
+CHUNK = 16  # blocks that a thread takes at a time
 REACH_BLOCKS = 2  # a label depends on patches so many blocks away
 CORNER_COS = 0.8  # planes that share a corner voxel differ by more than 37 degrees
 
@@ -176,45 +177,57 @@ def _flat(planes, count):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, parallel=True)
 def label_blocks(blocks, observable, patches, which, tolerance, changed):  # type: ignore[no-untyped-def]
     """Label every voxel of the blocks `which` again; mark the blocks where a label changed.
 
-    Reads the patches of the blocks up to two away (REACH_BLOCKS)."""
+    Reads the patches of the blocks up to two away (REACH_BLOCKS); every block writes its own
+    voxels: threads change nothing."""
     most = 125 * patches.votes.shape[1]
-    codes = np.empty(most, np.int16)
-    planes = np.empty((most, 5))
-    boxes = np.empty((most, 6), np.int64)
-    for q in range(which.shape[0]):
-        block = which[q]
-        near = _near_candidates(blocks, patches, block, codes, planes, boxes)
-        count = near
-        flat = _flat(planes, near)
-        for local in range(512):
-            row = blocks.rows[block, local]
-            if row < 0:
-                continue
-            seen = observable[row]
-            label, second, own = -1, -1, -1
-            if seen != 0:
-                if patches.member[row] >= 0:
-                    label = 16 * CENTRE + patches.member[row]
-                    for o in range(near):
-                        if codes[o] == label:
-                            own = o
-                else:
-                    own = _join(planes, boxes, near, local, seen, tolerance)
-                    if own >= 0:
-                        label = codes[own]
-            if own >= 0 and not flat:
-                c = _place(local, seen)
+    chunks = (which.shape[0] + CHUNK - 1) // CHUNK
+    for chunk in prange(chunks):
+        codes = np.empty(most, np.int16)
+        planes = np.empty((most, 5))
+        boxes = np.empty((most, 6), np.int64)
+        for q in range(chunk * CHUNK, min(which.shape[0], (chunk + 1) * CHUNK)):
+            changed[q] = _label_block(
+                blocks, observable, patches, which[q], tolerance, codes, planes, boxes
+            )
+
+
+@njit(cache=True, nogil=True)
+def _label_block(blocks, observable, patches, block, tolerance, codes, planes, boxes):  # type: ignore[no-untyped-def]
+    """Label the voxels of one block. Whether a label changed."""
+    changed = False
+    near = _near_candidates(blocks, patches, block, codes, planes, boxes)
+    count = near
+    flat = _flat(planes, near)
+    for local in range(512):
+        row = blocks.rows[block, local]
+        if row < 0:
+            continue
+        seen = observable[row]
+        label, second, own = -1, -1, -1
+        if seen != 0:
+            if patches.member[row] >= 0:
+                label = 16 * CENTRE + patches.member[row]
+                for o in range(near):
+                    if codes[o] == label:
+                        own = o
+            else:
+                own = _join(planes, boxes, near, local, seen, tolerance)
+                if own >= 0:
+                    label = codes[own]
+        if own >= 0 and not flat:
+            c = _place(local, seen)
+            other, alone = _claim(planes, boxes, near, count, c, tolerance, own)
+            if alone and count == near:
+                count = _far_candidates(blocks, patches, block, near, codes, planes, boxes)
                 other, alone = _claim(planes, boxes, near, count, c, tolerance, own)
-                if alone and count == near:
-                    count = _far_candidates(blocks, patches, block, near, codes, planes, boxes)
-                    other, alone = _claim(planes, boxes, near, count, c, tolerance, own)
-                if other >= 0:
-                    second = codes[other]
-            if patches.label[row] != label or patches.second[row] != second:
-                patches.label[row] = label
-                patches.second[row] = second
-                changed[q] = True
+            if other >= 0:
+                second = codes[other]
+        if patches.label[row] != label or patches.second[row] != second:
+            patches.label[row] = label
+            patches.second[row] = second
+            changed = True
+    return changed

@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from facet.mapping.blocks import unpack
-from facet.mapping.pivot import CELLS, HALO, boundary_edges
+from facet.mapping.pivot import CELLS, HALO, SIDE, boundary_edges
 from facet.mapping.rings import Outline, surfaces_of
 from facet.mapping.settings import STEPS, MapSettings
 from facet.mapping.store import VoxelStore
@@ -174,14 +174,12 @@ class ContourField:
         if not dirty:
             return False
         near = {(u + a, v + b) for u, v in dirty for a in (-1, 0, 1) for b in (-1, 0, 1)}
-        moved = False
-        for place in sorted(near & (contour.cells.keys() | contour.edges.keys())):
-            moved |= self._roll(contour, place)
-        if moved:
+        if self._roll(contour, sorted(near & (contour.cells.keys() | contour.edges.keys()))):
             edges = [contour.edges[p] for p in sorted(contour.edges) if len(contour.edges[p])]
             whole = np.concatenate(edges) if edges else np.zeros((0, 4), np.int32)
             contour.outlines = surfaces_of(whole.astype(np.int64), self._least)
-        return moved
+            return True
+        return False
 
     def _share(self, frame: PlaneFrame, store: VoxelStore, tile: Tile, plane: int) -> Share:
         points = np.empty((len(tile.rows), 2), np.int32)
@@ -212,27 +210,33 @@ class ContourField:
             contour.cells.pop(place, None)
         return old is None or not drawn or not np.array_equal(old, cells)
 
-    def _roll(self, contour: Contour, place: Place) -> bool:
-        """Find a tile's boundary edges again. Whether they changed."""
-        self.rolled += 1
-        old = contour.edges.get(place)
-        if place not in contour.cells:
-            contour.edges.pop(place, None)
-            return old is not None and len(old) > 0
-        edges = boundary_edges(self._window(contour, place))
-        edges += np.tile(np.array(place, np.int32) * SIZE, 2)
-        contour.edges[place] = edges
-        return old is None or not np.array_equal(old, edges)
+    def _roll(self, contour: Contour, places: list[Place]) -> bool:
+        """Find the boundary edges of tiles again. Whether any changed."""
+        self.rolled += len(places)
+        moved = False
+        for place in places:
+            if place not in contour.cells:
+                old = contour.edges.pop(place, None)
+                moved |= old is not None and len(old) > 0
+        drawn = [place for place in places if place in contour.cells]
+        windows = np.zeros((len(drawn), SIDE, SIDE), np.uint64)
+        for window, place in zip(windows, drawn, strict=True):
+            self._fill(window, contour, place)
+        for place, edges in zip(drawn, boundary_edges(windows), strict=True):
+            edges += np.tile(np.array(place, np.int32) * SIZE, 2)
+            old = contour.edges.get(place)
+            moved |= old is None or not np.array_equal(old, edges)
+            contour.edges[place] = edges
+        return moved
 
     @staticmethod
-    def _window(contour: Contour, place: Place) -> NDArray[np.uint64]:
-        window = np.zeros((CELLS + 2 * HALO,) * 2, np.uint64)
+    def _fill(window: NDArray[np.uint64], contour: Contour, place: Place) -> None:
+        """Copy a tile and its halo into a window."""
         for b, rows, own_rows in _PARTS:
             for a, columns, own_columns in _PARTS:
                 cells = contour.cells.get((place[0] + a, place[1] + b))
                 if cells is not None:
                     window[rows, columns] = cells[own_rows, own_columns]
-        return window
 
 
 _PARTS = (

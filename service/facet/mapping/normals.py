@@ -161,7 +161,8 @@ def _estimate(blocks, observable, block, local, rule, votes, shells, sums):  # t
     cx, cy, cz = seen & 15, (seen >> 4) & 15, (seen >> 8) & 15
     first = r  # the region that gives the first normal: smaller where the full one is thick
     while kind != ALIGNED:
-        for _ in range(rule.passes):  # look again: its own side, by the normal, and its own slab
+        passes = 1 if kind == VALID else rule.passes
+        for _ in range(passes):  # look again: its own side, by the normal, and its own slab
             own = nx * cx + ny * cy + nz * cz
             within_slab(votes, count, r, nx, ny, nz, own, rule.slab, sums)
             if sums[0] < rule.sparse:
@@ -226,7 +227,7 @@ def _estimate_rows(blocks, columns, normals, rows, rule, changed):  # type: igno
     Every row depends on observables alone and writes its own place: threads change nothing."""
     chunks = (rows.shape[0] + CHUNK - 1) // CHUNK
     for chunk in prange(chunks):
-        votes = np.empty((MOST, COLUMNS), np.int32)
+        votes = np.empty((MOST, COLUMNS))
         shells = np.zeros((rule.largest + 1, SUMS), np.int64)
         sums = np.zeros(SUMS, np.int64)
         for s in range(chunk * CHUNK, min(rows.shape[0], (chunk + 1) * CHUNK)):

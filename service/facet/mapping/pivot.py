@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+from numba import njit, prange
 from numpy.typing import NDArray
 
 from facet.mapping.bits import trailing_zeros
@@ -20,6 +20,7 @@ from facet.mapping.settings import ALPHA2
 
 CELLS = 64  # cells of a (u, v) tile's edge; a cell is one voxel, 8 x 8 grid points, one word
 HALO = 11  # cells: a point within 2 alpha is at most so far away
+SIDE = CELLS + 2 * HALO  # cells of a window's edge: a tile with its halo
 SPAN = math.isqrt(4 * ALPHA2)  # largest coordinate difference within 2 alpha
 _FULL = 2.0 * math.pi
 
@@ -137,14 +138,21 @@ def _roll(window, begin, length, around, edges):  # type: ignore[no-untyped-def]
     return num
 
 
-def boundary_edges(window: NDArray[np.uint64]) -> NDArray[np.int32]:
-    """(E, 4) edges (u, v, u', v') that start in the middle tile of a window of cells.
+@njit(cache=True, nogil=True, parallel=True)
+def _roll_all(windows, begin, length, around, edges, counts):  # type: ignore[no-untyped-def]
+    for n in prange(windows.shape[0]):
+        counts[n] = _roll(windows[n], begin, length, around, edges[n])
 
-    window: (CELLS + 2 HALO)^2 words, a bit u + 8 v for each grid point of a cell, rows by v."""
+
+def boundary_edges(windows: NDArray[np.uint64]) -> list[NDArray[np.int32]]:
+    """For each window (N, ..) of cells its edges (E, 4): (u, v, u', v') that start in the middle.
+
+    windows: (N, SIDE, SIDE) words, a bit u + 8 v for each grid point of a cell, rows by v."""
     room = 1024
     while True:
-        edges = np.empty((room, 4), np.int32)
-        count = int(_roll(window, _BEGIN, _LENGTH, _AROUND, edges))
-        if count >= 0:
-            return edges[:count].copy()
+        edges = np.empty((len(windows), room, 4), np.int32)
+        counts = np.empty(len(windows), np.int64)
+        _roll_all(windows, _BEGIN, _LENGTH, _AROUND, edges, counts)
+        if not (counts < 0).any():
+            return [own[:count].copy() for own, count in zip(edges, counts, strict=True)]
         room *= 4

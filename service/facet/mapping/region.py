@@ -28,7 +28,7 @@ def _merge_pose(one, other):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def collect(blocks, observable, block, local, r, view, least, votes, shells):  # type: ignore[no-untyped-def]
-    """List the occupied voxels within r (Chebyshev) of a voxel into votes (MOST, COLUMNS) int32,
+    """List the occupied voxels within r (Chebyshev) of a voxel into votes (MOST, COLUMNS) float64,
     and sum by distance, into shells (> r, SUMS), those whose view direction has more than `least`
     (times its length) along `view`; with least = -inf all. Returns how many are listed."""
     shells[: r + 1] = 0
@@ -123,17 +123,19 @@ def within(shells, r, sums):  # type: ignore[no-untyped-def]
 def within_slab(votes, count, r, nx, ny, nz, own, slab, sums):  # type: ignore[no-untyped-def]
     """Sums of the votes within r that were seen from the side of the normal and whose centroid
     lies within `slab` of n . c = own. The pose in sums stays."""
-    number, weight = np.int64(0), np.int64(0)
-    sx, sy, sz = np.int64(0), np.int64(0), np.int64(0)
-    sxx, sxy, sxz = np.int64(0), np.int64(0), np.int64(0)
-    syy, syz, szz = np.int64(0), np.int64(0), np.int64(0)
+    number, weight = 0.0, 0.0  # integers below 2^53: exact
+    sx, sy, sz = 0.0, 0.0, 0.0
+    sxx, sxy, sxz, syy, syz, szz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    limit = float(r)
     for i in range(count):
-        x, y, z = np.int64(votes[i, 0]), np.int64(votes[i, 1]), np.int64(votes[i, 2])
-        faces = nx * votes[i, 4] + ny * votes[i, 5] + nz * votes[i, 6] > 0.0
-        near = abs(nx * x + ny * y + nz * z - own) <= slab
-        if faces & near & (votes[i, 7] <= r):
-            w = np.int64(votes[i, 3])
-            number += 1
+        x, y, z = votes[i, 0], votes[i, 1], votes[i, 2]
+        if (
+            (votes[i, 7] <= limit)
+            & (abs(nx * x + ny * y + nz * z - own) <= slab)
+            & (nx * votes[i, 4] + ny * votes[i, 5] + nz * votes[i, 6] > 0.0)
+        ):
+            w = votes[i, 3]
+            number += 1.0
             weight += w
             wx, wy, wz = w * x, w * y, w * z
             sx += wx
@@ -145,9 +147,10 @@ def within_slab(votes, count, r, nx, ny, nz, own, slab, sums):  # type: ignore[n
             syy += wy * y
             syz += wy * z
             szz += wz * z
-    sums[0], sums[1] = number, weight
-    sums[2], sums[3], sums[4] = sx, sy, sz
-    sums[5], sums[6], sums[7], sums[8], sums[9], sums[10] = sxx, sxy, sxz, syy, syz, szz
+    sums[0], sums[1] = np.int64(number), np.int64(weight)
+    sums[2], sums[3], sums[4] = np.int64(sx), np.int64(sy), np.int64(sz)
+    sums[5], sums[6], sums[7] = np.int64(sxx), np.int64(sxy), np.int64(sxz)
+    sums[8], sums[9], sums[10] = np.int64(syy), np.int64(syz), np.int64(szz)
 
 
 @njit(cache=True, nogil=True)
