@@ -18,6 +18,7 @@ from facet.mapping.settings import TICKS
 
 # columns of `moments`: n, sum x, y, z, sum xx, xy, xz, yy, yz, zz of the local ticks 0..1023
 MOMENTS = 10
+SETTLED = 64  # from so many points on a centroid is rounded to 1/4 voxel: it moves half as often
 # columns of `views`: sum of the quantised unit vectors towards the sensor
 # columns of `poses`: line-scan points: count, sum h, sum h^2 of their pose hashes
 
@@ -93,22 +94,38 @@ def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched
 
 
 @njit(cache=True, nogil=True)
+def _coarse(component):  # type: ignore[no-untyped-def]
+    """A component of a direction in eighths, finely near zero, where it tells the side, coarsely
+    elsewhere, where it only drifts with the sensor: 0, 1, 2, 4 or 7."""
+    eighths = np.int64(np.floor(abs(component) * 8.0 + 0.5))
+    if eighths >= 6:
+        eighths = np.int64(7)
+    elif eighths >= 3:
+        eighths = np.int64(4)
+    return eighths if component > 0.0 else -eighths
+
+
+@njit(cache=True, nogil=True)
 def observe(moments, views, poses):  # type: ignore[no-untyped-def]
-    """A voxel's observable, 49 bits: centroid in eighths (4, 4, 4), votes min(n, 8) (4), direction
-    towards the sensor in eighths (5, 5, 5), mixed (1), pose hash + 1 of its only pose (17)."""
+    """A voxel's observable, 49 bits: centroid in eighths (4, 4, 4), from SETTLED points on in
+    quarters; votes min(n, 8) (4); direction towards the sensor, `_coarse` (5, 5, 5); mixed (1);
+    pose hash + 1 of its only pose (17). What only drifts as points come in is rounded coarsely:
+    each change makes some sixty neighbours stale."""
     n = moments[0]
     if n == 0:
         return np.int64(0)
     word = np.int64(0)
-    for axis in range(3):
-        word |= ((moments[1 + axis] * 16 + n * TICKS) // (2 * n * TICKS)) << (4 * axis)
+    coarse = 2 if n >= SETTLED else 1
+    for axis in range(3):  # round half up, to 1/8 voxel, or to 1/4
+        eighths = (moments[1 + axis] * 16 + n * TICKS * coarse) // (2 * n * TICKS * coarse)
+        word |= (eighths * coarse) << (4 * axis)
     word |= min(n, 8) << 12
     vx, vy, vz = float(views[0]), float(views[1]), float(views[2])
     length = np.sqrt((vx * vx + vy * vy) + vz * vz)
     if length > 0.0:
-        word |= (np.int64(np.floor(vx / length * 8.0 + 0.5)) + 8) << 16
-        word |= (np.int64(np.floor(vy / length * 8.0 + 0.5)) + 8) << 21
-        word |= (np.int64(np.floor(vz / length * 8.0 + 0.5)) + 8) << 26
+        word |= (_coarse(vx / length) + 8) << 16
+        word |= (_coarse(vy / length) + 8) << 21
+        word |= (_coarse(vz / length) + 8) << 26
     else:
         word |= (8 << 16) | (8 << 21) | (8 << 26)
     if length < 0.5 * VIEW * n:  # seen from both sides
