@@ -1,0 +1,68 @@
+"""What the benchmarks read of a mapper that it does not show: all of it here, and nowhere else."""
+
+from __future__ import annotations
+
+import ctypes
+import sys
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from facet.mapping.mapper import Mapper
+from facet.mapping.quantise import quantise
+from facet_protocol.messages import Scan
+
+
+def num_voxels(mapper: Mapper) -> int:
+    """Voxels that ever held a point: what grows as memory does."""
+    return int(mapper._store.num_rows)
+
+
+def points_in_view(mapper: Mapper, scan: Scan) -> NDArray[np.int64]:
+    """(W,) points of each voxel that a scan touches. Call it right after the scan's insert."""
+    store = mapper._store
+    return np.asarray(store.columns.moments[store.touched_rows, 0], np.int64)
+
+
+def forget_touched(mapper: Mapper, scan: Scan) -> NDArray[np.int64]:
+    """The same of a scan that is not to be in the map: inserted, looked at, and retracted."""
+    mapper.insert(scan)
+    counts = points_in_view(mapper, scan) - 1
+    mapper.retract(scan)
+    mapper.update()
+    return counts
+
+
+def radii(mapper: Mapper) -> NDArray[np.int64]:
+    """(V,) largest radius, voxels, that the normal of each voxel looked at."""
+    return np.asarray(mapper._normals.normals.reach[: num_voxels(mapper)], np.int64)
+
+
+def num_ticks(mapper: Mapper, scan: Scan) -> int:
+    return len(quantise(scan, mapper.settings).points)
+
+
+def free_bytes(mapper: Mapper) -> int:
+    """Bytes of the free-space grid that are in use."""
+    free = mapper._free
+    share = free.num_blocks / max(1, len(free._counts))
+    return int(sum(a.nbytes for a in _arrays(free)) * share)
+
+
+def rss_bytes() -> int:
+    """Resident memory, after what was freed has gone back to the system."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).malloc_trim(0)
+    with open("/proc/self/statm", encoding="ascii") as f:
+        return int(f.read().split()[1]) * 4096
+
+
+def _arrays(thing: Any) -> list[NDArray[Any]]:
+    found: list[NDArray[Any]] = []
+    for value in vars(thing).values():
+        if isinstance(value, np.ndarray):
+            found.append(value)
+        elif isinstance(value, tuple):
+            found += [a for a in value if isinstance(a, np.ndarray)]
+    return found
