@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from facet.config import ConfigError, is_loopback, load_config
+from facet.config import ConfigError, is_loopback, load_config, load_credentials
 
 
 def load(tmp_path: Path, text: str) -> object:
@@ -61,6 +61,8 @@ def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
         ("tcp/0.0.0.0:7447", False),
         ("tcp/[::]:7447", False),
         ("tcp/192.168.1.4:7447", False),
+        ("tcp/127.0.0.1.robots.example:7447", False),
+        ("tcp/127:7447", False),
         ("tls/robots.example:7447", False),
     ],
 )
@@ -78,7 +80,7 @@ KEYS = 'listen_certificate = "c.pem"\nlisten_private_key = "k.pem"\n'
         ('listen = ["tcp/0.0.0.0:7447"]\nusers_file = "u"', False),
         (OPEN, False),
         (OPEN + KEYS, False),
-        (OPEN + KEYS + "mutual_tls = true", True),
+        (OPEN + KEYS + 'mutual_tls = true\nroot_ca_certificate = "ca.pem"', True),
         (OPEN + KEYS + 'users_file = "u"', True),
     ],
 )
@@ -91,3 +93,37 @@ def test_the_network_is_let_in_by_key_and_name_only(
     else:
         with pytest.raises(ConfigError, match="open to the network"):
             load(tmp_path, text)
+
+
+@pytest.mark.parametrize(
+    ("network", "said"),
+    [
+        (OPEN + 'listen_certificate = "c.pem"', "belong together"),
+        (OPEN + KEYS + "mutual_tls = true", "needs root_ca_certificate"),
+        ('connect = ["tcp/10.0.0.9:7447"]', "in the clear"),
+    ],
+)
+def test_half_a_guard_is_none(tmp_path: Path, network: str, said: str) -> None:
+    with pytest.raises(ConfigError, match=said):
+        load(tmp_path, f"[network]\n{network}")
+
+
+def test_a_password_is_in_no_message(tmp_path: Path) -> None:
+    path = tmp_path / "robot.toml"
+    path.write_text('user = "r1"\npassword = "hush"\ncertificate = "r1.pem"')
+    told = load_credentials(path)
+    assert told.password is not None
+    assert told.password.get_secret_value() == "hush"
+    assert "hush" not in repr(told)
+    assert told.certificate == tmp_path / "r1.pem"  # beside the file
+    path.write_text("password = 12345")
+    with pytest.raises(ConfigError, match=r"password = \*\*\*") as error:
+        load_credentials(path)
+    assert "12345" not in str(error.value)
+
+
+def test_a_section_that_is_no_table_is_named(tmp_path: Path) -> None:
+    path = tmp_path / "facet.toml"
+    path.write_text("map = 3")
+    with pytest.raises(ConfigError, match="map = 3: should be a table"):
+        load_config(path, {"map.id": "hall"})

@@ -4,13 +4,26 @@ from __future__ import annotations
 
 import difflib
 import tomllib
+from ipaddress import ip_address
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator, model_validator
+from pydantic import (
+    BaseModel,
+    ConfigDict,
+    Field,
+    SecretStr,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
 
 MIB = 1 << 20
+ENCRYPTED = ("tls/", "quic/")
 Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
+
+
+S = TypeVar("S", bound="Section")
 
 
 class ConfigError(ValueError):
@@ -23,7 +36,10 @@ def is_loopback(endpoint: str) -> bool:
     if protocol.startswith("unix"):
         return True
     host = address.split("?")[0].split("#")[0].rpartition(":")[0].strip("[]")
-    return host == "localhost" or host == "::1" or host.startswith("127.")
+    try:
+        return host == "localhost" or ip_address(host).is_loopback
+    except ValueError:  # a name, and names can mean anything
+        return False
 
 
 class Section(BaseModel):
@@ -60,16 +76,23 @@ class NetworkSection(Section):
     listen: tuple[str, ...] = ("tcp/127.0.0.1:7447",)
     connect: tuple[str, ...] = ()
     max_message_bytes: int = Field(default=16 * MIB, ge=1024, le=48 * MIB)  # a chunk: 64 MiB
+    max_sessions: int = Field(default=256, ge=1, le=10_000)  # peers at once; the next is refused
     shared_memory: bool = True
     root_ca_certificate: Path | None = None
     listen_certificate: Path | None = None
     listen_private_key: Path | None = None
     mutual_tls: bool = False
     users_file: Path | None = None  # lines "user:password"
-    access_control: Path | None = None  # JSON5 table of Zenoh's access_control
+    access_control: Path | None = None  # JSON5: Zenoh's table of that name (docker/secure)
+
+    credentials: Path | None = None  # TOML: what we show to the routers of `connect`
 
     @model_validator(mode="after")
     def _closed_to_strangers(self) -> NetworkSection:
+        if (self.listen_certificate is None) != (self.listen_private_key is None):
+            raise ValueError("listen_certificate and listen_private_key belong together")
+        if self.mutual_tls and self.root_ca_certificate is None:
+            raise ValueError("mutual_tls needs root_ca_certificate: who signed the robots' own")
         for endpoint in self.listen:
             if not is_loopback(endpoint) and not self._is_guarded(endpoint):
                 raise ValueError(
@@ -77,12 +100,25 @@ class NetworkSection(Section):
                     "Listen on 127.0.0.1, or use tls/ or quic/ with listen_certificate, "
                     "listen_private_key and either mutual_tls or users_file"
                 )
+        for endpoint in self.connect:
+            if not is_loopback(endpoint) and not endpoint.startswith(ENCRYPTED):
+                raise ValueError(f"{endpoint} leaves this machine in the clear: use tls/ or quic/")
         return self
 
     def _is_guarded(self, endpoint: str) -> bool:
-        encrypted = endpoint.startswith(("tls/", "quic/"))
-        has_keys = self.listen_certificate is not None and self.listen_private_key is not None
-        return encrypted and has_keys and (self.mutual_tls or self.users_file is not None)
+        has_keys = self.listen_certificate is not None
+        known = self.mutual_tls or self.users_file is not None
+        return endpoint.startswith(ENCRYPTED) and has_keys and known
+
+
+class Credentials(Section):
+    """What a client shows at a guarded door: a file of its own, readable by its owner alone."""
+
+    user: str | None = None
+    password: SecretStr | None = None
+    root_ca_certificate: Path | None = None
+    certificate: Path | None = None
+    private_key: Path | None = None
 
 
 class QueueSection(Section):
@@ -142,10 +178,21 @@ def load_config(path: Path | None = None, overrides: dict[str, Any] | None = Non
     for dotted, value in (overrides or {}).items():
         if value is not None:
             _put(tree, dotted.split("."), value)
+    return _validate(Config, tree)
+
+
+def load_credentials(path: Path) -> Credentials:
+    """What a file of credentials says; paths in it are relative to it. Raises ConfigError."""
+    told = _validate(Credentials, _read_toml(path))
+    paths = {k: path.parent / v for k, v in told if isinstance(v, Path)}
+    return told.model_copy(update=paths)
+
+
+def _validate(model: type[S], tree: dict[str, Any]) -> S:
     try:
-        return Config.model_validate(tree)
+        return model.model_validate(tree)
     except ValidationError as error:
-        raise ConfigError("; ".join(_explain(e) for e in error.errors())) from None
+        raise ConfigError("; ".join(_explain(model, e) for e in error.errors())) from None
 
 
 def _read_toml(path: Path) -> dict[str, Any]:
@@ -160,22 +207,24 @@ def _read_toml(path: Path) -> dict[str, Any]:
 def _put(tree: dict[str, Any], keys: list[str], value: Any) -> None:
     for key in keys[:-1]:
         tree = tree.setdefault(key, {})
+        if not isinstance(tree, dict):
+            raise ConfigError(f"{key} = {tree!r:.200}: should be a table")
     tree[keys[-1]] = value
 
 
-def _explain(error: Any) -> str:
+def _explain(model: type[BaseModel], error: Any) -> str:
     """One line for one of pydantic's errors: key, value, and what would have been right."""
     where = ".".join(str(part) for part in error["loc"])
     if error["type"] == "extra_forbidden":
-        return f"unknown key {where}{_nearest(error['loc'])}"
+        return f"unknown key {where}{_nearest(model, error['loc'])}"
     if error["type"] == "value_error":
         return f"{where}: {error['ctx']['error']}" if where else str(error["ctx"]["error"])
     text = error["msg"][:1].lower() + error["msg"][1:]
-    return f"{where} = {error['input']!r}: {text}{_range(error['loc'])}"
+    value = "***" if where == "password" else f"{error['input']!r:.200}"
+    return f"{where} = {value}: {text}{_range(model, error['loc'])}"
 
 
-def _section(loc: tuple[Any, ...]) -> type[BaseModel]:
-    model: type[BaseModel] = Config
+def _section(model: type[BaseModel], loc: tuple[Any, ...]) -> type[BaseModel]:
     for part in loc[:-1]:
         field = model.model_fields.get(str(part))
         annotation = field.annotation if field else None
@@ -184,14 +233,14 @@ def _section(loc: tuple[Any, ...]) -> type[BaseModel]:
     return model
 
 
-def _nearest(loc: tuple[Any, ...]) -> str:
-    known = list(_section(loc).model_fields)
+def _nearest(model: type[BaseModel], loc: tuple[Any, ...]) -> str:
+    known = list(_section(model, loc).model_fields)
     near = difflib.get_close_matches(str(loc[-1]), known, n=1, cutoff=0.0)
     return f"; did you mean {'.'.join([*map(str, loc[:-1]), near[0]])}?" if near else ""
 
 
-def _range(loc: tuple[Any, ...]) -> str:
-    field = _section(loc).model_fields.get(str(loc[-1]))
+def _range(model: type[BaseModel], loc: tuple[Any, ...]) -> str:
+    field = _section(model, loc).model_fields.get(str(loc[-1]))
     signs = {"ge": ">=", "gt": ">", "le": "<=", "lt": "<"}
     limits = [
         f"{sign} {getattr(constraint, name)}"

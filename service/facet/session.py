@@ -5,14 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import zenoh
 
-from facet.config import NetworkSection
+from facet.config import ConfigError, NetworkSection, load_credentials
 
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 CONNECT_TIMEOUT_MS = 3000
+ENVELOPE_BYTES = 1 << 16  # what travels beside a payload: key, encoding, attachment
+MAX_PENDING = 64  # connections that have not shown who they are
 
 
 @contextmanager
@@ -32,20 +35,54 @@ def service_settings(network: NetworkSection) -> dict[str, Any]:
         "listen/endpoints": list(network.listen),
         "connect/endpoints": list(network.connect),
         "low_pass_filter": [_size_limit(network.max_message_bytes)],
+        "transport/link/rx/max_message_size": network.max_message_bytes + ENVELOPE_BYTES,
+        "transport/unicast/max_sessions": network.max_sessions,
+        "transport/unicast/accept_pending": min(MAX_PENDING, network.max_sessions),
         "transport/shared_memory/enabled": network.shared_memory,
     }
+    shown = _shown(network.credentials) if network.credentials is not None else {}
     if network.listen_certificate is not None:
-        settings["transport/link/tls"] = _tls(network)
+        settings["transport/link/tls"] = shown.get("transport/link/tls", {}) | _tls(network)
     if network.users_file is not None:
-        settings["transport/auth/usrpwd"] = {"dictionary_file": str(network.users_file)}
+        users = {"dictionary_file": str(_existing(network.users_file))}
+        settings["transport/auth/usrpwd"] = shown.get("transport/auth/usrpwd", {}) | users
+    settings = shown | settings
     if network.access_control is not None:
-        settings["access_control"] = json.loads(network.access_control.read_text("utf-8"))
+        settings["access_control"] = read_access_control(network.access_control)
     return settings
 
 
-def client_settings(endpoint: str = DEFAULT_ENDPOINT, shared_memory: bool = True) -> dict[str, Any]:
-    """A client of a running service; fails when nobody answers within CONNECT_TIMEOUT_MS."""
-    return {
+def read_access_control(path: Path) -> dict[str, Any]:
+    """Zenoh's table `access_control` from a JSON5 file.
+
+    Raises ConfigError when it cannot be read, lets in what it does not name, or trusts a Zenoh id:
+    anyone can call himself any.
+    """
+    try:
+        text = path.read_text("utf-8")
+        config = zenoh.Config.from_json5(f"{{access_control: {text}\n}}")
+        table: dict[str, Any] = json.loads(config.get_json("access_control"))
+    except OSError as error:
+        raise ConfigError(f"network.access_control: {path}: {error.strerror}") from error
+    except (zenoh.ZError, ValueError) as error:
+        raise ConfigError(f"network.access_control: {path}: {error}") from error
+    if not table["enabled"] or table["default_permission"] != "deny":
+        text = 'must say enabled: true and default_permission: "deny"'
+        raise ConfigError(f"network.access_control: {path}: {text}")
+    if any(subject.get("zids") for subject in table["subjects"] or ()):
+        text = "zids prove nothing: name cert_common_names or usernames"
+        raise ConfigError(f"network.access_control: {path}: {text}")
+    return table
+
+
+def client_settings(
+    endpoint: str = DEFAULT_ENDPOINT, shared_memory: bool = True, credentials: Path | None = None
+) -> dict[str, Any]:
+    """A client of a running service; fails when nobody answers within CONNECT_TIMEOUT_MS.
+
+    `credentials` is a TOML file (`facet.config.Credentials`). Raises ConfigError.
+    """
+    settings = {
         "mode": "client",
         "listen/endpoints": [],
         "connect/endpoints": [endpoint],
@@ -53,6 +90,25 @@ def client_settings(endpoint: str = DEFAULT_ENDPOINT, shared_memory: bool = True
         "transport/shared_memory/enabled": shared_memory,
         "timestamping/enabled": True,  # the advanced publisher needs it
     }
+    return settings | (_shown(credentials) if credentials is not None else {})
+
+
+def _shown(path: Path) -> dict[str, Any]:
+    """User and password, certificate and key, as far as the file has them."""
+    told, settings = load_credentials(path), dict[str, Any]()
+    if told.user is not None and told.password is not None:
+        secret = told.password.get_secret_value()
+        settings["transport/auth/usrpwd"] = {"user": told.user, "password": secret}
+    tls: dict[str, Any] = {}
+    if told.root_ca_certificate is not None:
+        tls["root_ca_certificate"] = str(_existing(told.root_ca_certificate))
+    if told.certificate is not None and told.private_key is not None:
+        tls["connect_certificate"] = str(_existing(told.certificate))
+        tls["connect_private_key"] = str(_existing(told.private_key))
+        tls["enable_mtls"] = True
+    if tls:
+        settings["transport/link/tls"] = tls
+    return settings
 
 
 def _config(settings: dict[str, Any]) -> zenoh.Config:
@@ -79,14 +135,24 @@ def _size_limit(max_bytes: int) -> dict[str, Any]:
 
 
 def _tls(network: NetworkSection) -> dict[str, Any]:
+    assert network.listen_certificate is not None
+    assert network.listen_private_key is not None
     tls: dict[str, Any] = {
-        "listen_certificate": str(network.listen_certificate),
-        "listen_private_key": str(network.listen_private_key),
+        "listen_certificate": str(_existing(network.listen_certificate)),
+        "listen_private_key": str(_existing(network.listen_private_key)),
         "enable_mtls": network.mutual_tls,
+        "close_link_on_expiration": True,
     }
     if network.root_ca_certificate is not None:
-        tls["root_ca_certificate"] = str(network.root_ca_certificate)
+        tls["root_ca_certificate"] = str(_existing(network.root_ca_certificate))
     return tls
+
+
+def _existing(path: Path) -> Path:
+    """The path itself. Raises ConfigError when there is no such file: Zenoh would only time out."""
+    if not path.is_file():
+        raise ConfigError(f"{path}: no such file")
+    return path
 
 
 def client_endpoint(network: NetworkSection) -> str:

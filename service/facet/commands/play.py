@@ -107,6 +107,10 @@ def play(
     robot: Annotated[str | None, typer.Option(help="Publish under this robot's name.")] = None,
     map_id: Annotated[str, typer.Option("--map", help="The map to add to.")] = "map",
     connect: Annotated[str, typer.Option(help="The service's endpoint.")] = DEFAULT_ENDPOINT,
+    credentials: Annotated[
+        Path | None,
+        typer.Option(envvar="FACET_CREDENTIALS", help="What to show at a guarded endpoint (TOML)."),
+    ] = None,
     shared_memory: Annotated[bool, typer.Option(help="Large scans by shared memory.")] = True,
 ) -> None:
     """Publish a recording over Zenoh, as the robot would.
@@ -120,7 +124,7 @@ def play(
     if robot is not None:
         check_id(robot)
     recording = Recording(existing(logs))
-    settings = client_settings(connect, shared_memory)
+    settings = client_settings(connect, shared_memory, credentials)
     with open_session(settings) as session, progress("playing", _count(logs)) as bar:
         publisher = RobotPublisher(session, map_id)
         num = 0

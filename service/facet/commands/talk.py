@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Iterator
 from itertools import zip_longest
+from pathlib import Path
 from typing import Annotated
 
 import typer
@@ -23,6 +24,10 @@ from facet_protocol.records import decode_status
 WAIT_S = 3.0  # the service speaks once a second
 MapOption = Annotated[str, typer.Option("--map", help="Name of the map.")]
 ConnectOption = Annotated[str, typer.Option(help="The service's endpoint.")]
+CredentialsOption = Annotated[
+    Path | None,
+    typer.Option(envvar="FACET_CREDENTIALS", help="What to show at a guarded endpoint (TOML)."),
+]
 
 
 def statuses(session: zenoh.Session, map_id: str) -> Iterator[Status | None]:
@@ -43,7 +48,11 @@ def _next(subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]) ->
     return None
 
 
-def status(map_id: MapOption = "map", connect: ConnectOption = DEFAULT_ENDPOINT) -> None:
+def status(
+    map_id: MapOption = "map",
+    connect: ConnectOption = DEFAULT_ENDPOINT,
+    credentials: CredentialsOption = None,
+) -> None:
     """How a running service is.
 
     \b
@@ -52,7 +61,7 @@ def status(map_id: MapOption = "map", connect: ConnectOption = DEFAULT_ENDPOINT)
 
     Exit code 3: it lives, but its health is not OK; 74: nobody answers.
     """
-    with open_session(client_settings(connect)) as session:
+    with open_session(client_settings(connect, credentials=credentials)) as session:
         current = next(statuses(session, map_id))
         if current is None:
             raise InputError(f"no service maps {map_id!r} at {connect}")
@@ -60,10 +69,14 @@ def status(map_id: MapOption = "map", connect: ConnectOption = DEFAULT_ENDPOINT)
     raise typer.Exit(Exit.CLEAN if current.health == "OK" else Exit.LOST)
 
 
-def top(map_id: MapOption = "map", connect: ConnectOption = DEFAULT_ENDPOINT) -> None:
+def top(
+    map_id: MapOption = "map",
+    connect: ConnectOption = DEFAULT_ENDPOINT,
+    credentials: CredentialsOption = None,
+) -> None:
     """The same, every second, until Ctrl-C."""
     with (
-        open_session(client_settings(connect)) as session,
+        open_session(client_settings(connect, credentials=credentials)) as session,
         Live(console=out, screen=out.is_terminal, auto_refresh=False) as live,
     ):
         for current in statuses(session, map_id):
@@ -78,6 +91,7 @@ def cmd(
     parameters: Annotated[list[str] | None, typer.Argument(help="key=value")] = None,
     map_id: MapOption = "map",
     connect: ConnectOption = DEFAULT_ENDPOINT,
+    credentials: CredentialsOption = None,
 ) -> None:
     """Tell a running service what to do.
 
@@ -92,7 +106,7 @@ def cmd(
         raise typer.BadParameter(str(error)) from error
     if parameters:
         selector += "?" + ";".join(parameters)
-    with open_session(client_settings(connect)) as session:
+    with open_session(client_settings(connect, credentials=credentials)) as session:
         replies = list(session.get(selector, timeout=15.0))
     if not replies:
         raise InputError(f"no service maps {map_id!r} at {connect}")

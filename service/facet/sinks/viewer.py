@@ -15,6 +15,7 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import suppress
+from pathlib import Path
 
 import zenoh
 
@@ -42,13 +43,15 @@ def follow(
     target: str,
     stop: threading.Event | None = None,
     bind: str = "127.0.0.1",
+    credentials: Path | None = None,
 ) -> None:
     """Draw the map of a service until `stop` is set; waits for the service, and for the viewer."""
     stop = stop or threading.Event()
     with Screen(target, map_id, bind) as screen:
         while not stop.is_set():
             try:
-                with open_session(client_settings(endpoint)) as session:
+                settings = client_settings(endpoint, credentials=credentials)
+                with open_session(settings) as session:
                     Follower(session, map_id, screen).run(stop)
             except zenoh.ZError as error:
                 logger.info("no service at %s yet: %s", endpoint, error)
@@ -208,7 +211,9 @@ def _follow_or_fail(
     options: argparse.Namespace, stop: threading.Event, failures: list[Exception]
 ) -> None:
     try:
-        follow(options.endpoint, options.map, options.target, stop, options.bind)
+        shown = os.environ.get("FACET_CREDENTIALS")
+        credentials = Path(shown) if shown else None
+        follow(options.endpoint, options.map, options.target, stop, options.bind, credentials)
     except Exception as error:
         logger.exception("the viewer failed")
         failures.append(error)
