@@ -10,6 +10,7 @@ from mcap.writer import CompressionType, Writer
 from facet.sinks.durable_file import DurableFile
 from facet_protocol.codec import Message, descriptor_set
 from facet_protocol.messages import Envelope, ProtocolError, Scan, TilePoints
+from facet_protocol.metadata import signed
 
 COMPRESSIONS = {
     "lz4": CompressionType.LZ4,
@@ -36,7 +37,7 @@ class LogFile:
             compression=COMPRESSIONS[compression],
         )
         self._writer.start(profile="", library="facet")
-        self._writer.add_metadata("facet", dict(metadata))
+        self._writer.add_metadata("facet", signed(metadata))
 
     @property
     def num_bytes(self) -> int:

@@ -1,26 +1,46 @@
-"""One MCAP file in file order: every message of every whole chunk, and what is damaged."""
+"""One MCAP file in file order: every message of every whole chunk, and what is damaged.
+
+Nothing in the file is believed that can be checked: a chunk by its CRC, any other record by what
+follows it, the whole by its own statistics. After a record that cannot be read, the next good chunk
+is searched for. What is read is held in memory one chunk at a time.
+"""
 
 from __future__ import annotations
 
 import struct
 import zlib
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from dataclasses import dataclass, field
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
-import lz4.frame  # type: ignore[import-untyped]
-import zstandard
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, Metadata, Schema, Statistics
+from mcap.records import Channel, DataEnd, Metadata, Statistics
+
+from facet.sources.mcap_chunk import (
+    HEAD,
+    HEAD_BYTES,
+    MAX_RECORD_BYTES,
+    find_chunk,
+    inflate,
+    is_chunk,
+    parse_chunk,
+    records_of,
+)
+from facet.sources.mcap_definitions import Definitions
+from facet_protocol.metadata import METADATA_CRC, metadata_crc
 
 MAGIC = b"\x89MCAP0\r\n"
-MAX_CHUNK_BYTES = 64 << 20  # decompressed; more is a bomb
-_HEAD = struct.Struct("<BQ")  # opcode, length of what follows
+MAX_NOTES = 100
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
-_CHUNK = struct.Struct("<QQQI")  # start, end, uncompressed size, uncompressed CRC
+_INDEX = struct.Struct("<HI")  # of messages: channel, length of the entries
+_FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary start, offsets start, summary CRC
+_INDEX_ENTRY_BYTES = 16
+_KNOWN = frozenset(int(opcode) for opcode in Opcode)
+
+Reading = Generator["LogMessage", None, int]  # returns the offset at which to go on
 
 
 class LogError(ValueError):
@@ -48,158 +68,290 @@ class Damage:
     """What a file has lost: empty when it is whole."""
 
     notes: list[str] = field(default_factory=list)
-    lost_messages: int = 0  # known from the file's own statistics
+    lost_messages: int = 0  # as far as the file itself still says
     lost_bytes: int = 0
 
     def add(self, offset: int, num_bytes: int, reason: str) -> None:
-        self.notes.append(f"byte {offset}: {reason}")
         self.lost_bytes += num_bytes
+        if len(self.notes) < MAX_NOTES:
+            self.notes.append(f"byte {offset}: {reason}")
+        elif len(self.notes) == MAX_NOTES:
+            self.notes.append(f"byte {offset}: and more")
 
     def __bool__(self) -> bool:
         return bool(self.notes)
 
+    def __str__(self) -> str:
+        return f"lost {self.lost_messages:,} messages that are known of, {self.lost_bytes:,} bytes"
+
 
 class McapStream:
-    """Reads one file once, front to back, whole or cut off; `damage` is complete afterwards."""
+    """Reads one file once, front to back, whole or damaged; `damage` is complete afterwards."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, start: int = 0, known: Definitions | None = None) -> None:
+        """From `start`, the offset of a record; what was defined before it is given as `known`."""
         self.path = path
         self.damage = Damage()
         self.metadata: list[Metadata] = []
         self.num_messages = 0
         self.num_chunks = 0
+        self.num_unchecked = 0  # messages that no checksum vouches for
         self.is_finished = False  # the footer was there
-        self._schemas: dict[int, Schema] = {}
-        self._channels: dict[int, Channel] = {}
+        self._start = start
+        self._definitions = known or Definitions()
         self._statistics: Statistics | None = None
         self._size = 0
+        self._has_lost_chunk = False  # the one just before
+        self._crc: int | None = 0  # of the file so far, while it has no chunks, and was all read
 
     def messages(self) -> Iterator[LogMessage]:
         """Every message of every whole chunk. Raises LogError when it is no MCAP file at all."""
         self._size = self.path.stat().st_size
-        with self.path.open("rb") as file:
-            if file.read(len(MAGIC)) != MAGIC:
-                raise LogError(self.path, 0, "this is not an MCAP file")
-            while not self.is_finished:
-                record = self._next_record(file)
-                if record is None:
-                    break
-                yield from self._read(*record)
-            if self.is_finished and file.read(len(MAGIC)) != MAGIC:
-                self.damage.add(file.tell(), 0, "the last magic is missing")
+        with self.path.open("rb", buffering=1 << 18) as file:
+            self._read_summary(file)
+            at = yield from self._begin(file)
+            while at < self._size and not self.is_finished:
+                at = yield from self._record(file, at)
+        if not self.is_finished and not self.damage:
+            self.damage.add(self._size, 0, "the file was not finished: it is cut off here")
         self._check_counts()
 
-    def _next_record(self, file: BinaryIO) -> tuple[int, int, bytes] | None:
-        """(offset, opcode, content) of the next record; None at the end of what can be read."""
-        offset = file.tell()
-        head = file.read(_HEAD.size)
-        if len(head) == _HEAD.size:
-            opcode, length = _HEAD.unpack(head)
-            if length <= self._size - offset - _HEAD.size and opcode != 0:
-                return offset, opcode, file.read(length)
-        rest = self._size - offset
-        self.damage.add(offset, rest, f"the file is cut off, {rest} bytes are no whole record")
-        return None
+    def _begin(self, file: BinaryIO) -> Reading:
+        file.seek(0)
+        magic = file.read(len(MAGIC))
+        if self._start:
+            return self._start
+        self._crc = zlib.crc32(magic)
+        if magic == MAGIC:
+            return len(MAGIC)
+        if len(magic) < len(MAGIC) and MAGIC.startswith(magic):
+            self.damage.add(0, len(magic), "the file is cut off before its first record")
+            return self._size
+        found = find_chunk(file, 0, self._size)
+        if found is None:
+            raise LogError(self.path, 0, "this is not an MCAP file")
+        return (yield from self._salvage(file, 0, "the first magic is wrong"))
 
-    def _read(self, offset: int, opcode: int, content: bytes) -> Iterator[LogMessage]:
+    def _record(self, file: BinaryIO, at: int) -> Reading:
+        """Read the record at `at`."""
+        file.seek(at)
+        head = file.read(HEAD_BYTES)
+        opcode, length = HEAD.unpack(head) if len(head) == HEAD_BYTES else (0, 0)
+        end: int = at + HEAD_BYTES + length
+        if not _begins_record(opcode, length) or end > self._size:
+            return (yield from self._cut_off(file, at, opcode, length))
+        if opcode == Opcode.ATTACHMENT or length > MAX_RECORD_BYTES:
+            return (yield from self._skip(file, at, opcode, end))
+        content = file.read(length)
+        if opcode == Opcode.CHUNK or (opcode != Opcode.MESSAGE and is_chunk(content)):
+            return (yield from self._chunk(file, at, opcode, content))
+        if not self._is_followed(file, end, opcode):
+            reason = f"{_name(opcode)} of {length} bytes, and then no record"
+            return (yield from self._salvage(file, at, reason))
         try:
-            if opcode == Opcode.CHUNK:
-                yield from self._chunk(content)
-            elif opcode == Opcode.MESSAGE:
-                yield self._message(memoryview(content))
+            if opcode == Opcode.MESSAGE:
+                yield self._message(content)
             else:
                 self._note(opcode, content)
-        except Exception as error:  # noqa: BLE001 damaged bytes raise anything: struct, key, lz4, zstd
-            self.damage.add(offset, len(content), f"{_name(opcode)} is damaged ({error})")
+        except Exception as error:  # noqa: BLE001 damaged bytes raise anything: struct, key, unicode
+            self.damage.add(at, HEAD_BYTES + length, f"{_name(opcode)} is damaged ({error})")
+        if self._crc is not None and opcode != Opcode.DATA_END:
+            self._crc = zlib.crc32(content, zlib.crc32(head, self._crc))
+        return end
+
+    def _cut_off(self, file: BinaryIO, at: int, opcode: int, length: int) -> Reading:
+        """No whole record begins at `at`: a chunk that says itself that it is longer ends the
+        file, anything else may be followed by good chunks."""
+        rest = self._size - at
+        reason = f"the file is cut off, {rest} bytes are no whole record"
+        if opcode == Opcode.CHUNK and is_chunk(file.read(64), length):
+            self._lose(at, rest, reason)
+            return self._size
+        return (yield from self._salvage(file, at, reason))
+
+    def _skip(self, file: BinaryIO, at: int, opcode: int, end: int) -> Reading:
+        """Go past what is not read."""
+        self._crc = None
+        if not self._is_followed(file, end, opcode):
+            reason = f"{_name(opcode)} of {end - at} bytes, and then no record"
+            return (yield from self._salvage(file, at, reason))
+        if opcode != Opcode.ATTACHMENT:
+            self._lose(at, end - at, f"{_name(opcode)} of {end - at} bytes is too long to be read")
+        return end
+
+    def _chunk(self, file: BinaryIO, at: int, opcode: int, content: bytes) -> Reading:
+        end = at + HEAD_BYTES + len(content)
+        try:
+            chunk = parse_chunk(content)
+            data = inflate(chunk, content)
+            self._checkrecords_of(data)
+        except Exception as error:  # noqa: BLE001 as above
+            reason = f"a chunk is damaged ({error})"
+            if is_chunk(content) and self._is_followed(file, end, opcode):
+                self._lose(at, end - at, reason)
+                return end
+            return (yield from self._salvage(file, at, reason))
+        if opcode != Opcode.CHUNK:
+            self.damage.add(at, 0, f"a chunk was marked as {_name(opcode)}")
+        yield from self._messages(data, is_checked=bool(chunk.crc))
+        is_followed = self._is_followed(file, end, opcode)
+        return end if is_followed else at + HEAD_BYTES + chunk.end
+
+    def _salvage(self, file: BinaryIO, at: int, reason: str) -> Reading:
+        """Go on at the next good chunk: all before it is lost."""
+        start = at
+        while (found := find_chunk(file, start, self._size)) is not None:
+            offset, chunk, data = found
+            try:
+                self._checkrecords_of(data)
+            except Exception:  # noqa: BLE001 as above
+                start = offset + 1
+                continue
+            self._lose(at, max(0, offset - HEAD_BYTES - at), reason)
+            yield from self._messages(data, is_checked=True)
+            return offset + chunk.end
+        self._lose(at, self._size - at, reason)
+        return self._size
+
+    def _lose(self, at: int, num_bytes: int, reason: str) -> None:
+        self.damage.add(at, num_bytes, reason)
+        self._has_lost_chunk = num_bytes > 0
+
+    def _checkrecords_of(self, data: bytes) -> None:
+        """Take the definitions of a chunk. Raises ValueError unless every message can be read."""
+        for opcode, start, end in records_of(data):
+            if opcode == Opcode.MESSAGE:
+                if end - start < _MESSAGE.size:
+                    raise ValueError("a message is too short")
+                self._definitions.find(_MESSAGE.unpack_from(data, start)[0])
+            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._definitions.read(opcode, data[start:end])
+
+    def _messages(self, data: bytes, is_checked: bool) -> Iterator[LogMessage]:
+        self.num_chunks += 1
+        self._has_lost_chunk = False
+        self._crc = None
+        view = memoryview(data)
+        for opcode, start, end in records_of(data):
+            if opcode == Opcode.MESSAGE:
+                self.num_messages += 1
+                self.num_unchecked += not is_checked
+                yield self._parse(view[start:end])
+
+    def _message(self, content: bytes) -> LogMessage:
+        """A message outside of chunks."""
+        if self.num_chunks:
+            raise ValueError("it lies outside of the chunks: no checksum vouches for it")
+        message = self._parse(memoryview(content))
+        self.num_messages += 1
+        self.num_unchecked += 1
+        return message
+
+    def _parse(self, content: memoryview) -> LogMessage:
+        channel_id, sequence, log_time, publish_time = _MESSAGE.unpack_from(content)
+        channel, schema = self._definitions.find(channel_id)
+        payload = content[_MESSAGE.size :]
+        return LogMessage(channel, schema, payload, sequence, log_time, publish_time)
 
     def _note(self, opcode: int, content: bytes) -> None:
         """Everything that is no message: schemas, channels, metadata, the summary."""
         stream = ReadDataStream(BytesIO(content))
-        if opcode == Opcode.SCHEMA:
-            schema = Schema.read(stream)
-            self._schemas[schema.id] = schema
-        elif opcode == Opcode.CHANNEL:
-            channel = Channel.read(stream)
-            self._channels[channel.id] = channel
+        if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+            self._definitions.read(opcode, content)
         elif opcode == Opcode.METADATA:
-            self.metadata.append(Metadata.read(stream))
+            self._note_metadata(Metadata.read(stream), len(content))
+        elif opcode == Opcode.MESSAGE_INDEX:
+            self._note_index(content)
         elif opcode == Opcode.STATISTICS:
             self._statistics = Statistics.read(stream)
+        elif opcode == Opcode.DATA_END:
+            self._check_data(DataEnd.read(stream).data_section_crc)
         elif opcode == Opcode.FOOTER:
             self.is_finished = True
-        elif opcode < 0x80 and opcode not in set(Opcode):
+        elif opcode < 0x80 and opcode not in _KNOWN:
             raise ValueError("unknown record")  # the specification leaves 0x80 up to others
 
-    def _chunk(self, content: bytes) -> Iterator[LogMessage]:
-        data = memoryview(_decompress(content))
-        messages: list[LogMessage] = []  # of a chunk, all or nothing
-        at = 0
-        while at < len(data):
-            opcode, length = _HEAD.unpack_from(data, at)
-            start, at = at + _HEAD.size, at + _HEAD.size + length
-            if at > len(data):
-                raise ValueError("a record reaches past the end of its chunk")
-            if opcode == Opcode.MESSAGE:
-                messages.append(self._parse_message(data[start:at]))
+    def _note_metadata(self, metadata: Metadata, num_bytes: int) -> None:
+        self._definitions.make_room(num_bytes)
+        crc = metadata.metadata.pop(METADATA_CRC, None)
+        if crc is not None and crc != metadata_crc(metadata.metadata):
+            raise ValueError("wrong checksum")
+        self.metadata.append(metadata)
+
+    def _note_index(self, content: bytes) -> None:
+        """How many messages a chunk held: of a lost one, that many are lost."""
+        _channel, num_bytes = _INDEX.unpack_from(content)
+        if num_bytes % _INDEX_ENTRY_BYTES or _INDEX.size + num_bytes > len(content):
+            raise ValueError(f"{num_bytes} bytes of entries in {len(content)}")
+        if self._has_lost_chunk:
+            self.damage.lost_messages += num_bytes // _INDEX_ENTRY_BYTES
+
+    def _check_data(self, crc: int) -> None:
+        if crc and self._crc is not None and not self._start and not self.damage:
+            if crc != self._crc:
+                text = "the checksum of all messages is wrong: one is not as it was written"
+                self.damage.add(0, 0, text)
             else:
-                self._note(opcode, bytes(data[start:at]))
-        self.num_chunks += 1
-        self.num_messages += len(messages)
-        yield from messages
+                self.num_unchecked = 0
 
-    def _message(self, content: memoryview) -> LogMessage:
-        message = self._parse_message(content)
-        self.num_messages += 1
-        return message
+    def _is_followed(self, file: BinaryIO, end: int, opcode: int) -> bool:
+        """Whether what comes next is a record, or the end where there may be one."""
+        file.seek(end)
+        if opcode == Opcode.FOOTER:
+            return file.read(len(MAGIC) + 1) == MAGIC
+        head = file.read(HEAD_BYTES)
+        return len(head) < HEAD_BYTES or _begins_record(*HEAD.unpack(head))
 
-    def _parse_message(self, content: memoryview) -> LogMessage:
-        channel_id, sequence, log_time, publish_time = _MESSAGE.unpack_from(content)
-        channel = self._channels.get(channel_id)
-        if channel is None:
-            raise ValueError(f"no channel {channel_id}")
-        schema = self._schemas[channel.schema_id].name if channel.schema_id else ""
-        payload = content[_MESSAGE.size :]
-        return LogMessage(channel, schema, payload, sequence, log_time, publish_time)
+    def _read_summary(self, file: BinaryIO) -> None:
+        """What a finished file says at its end, if its CRC vouches for that: definitions that a
+        lost chunk would take with it, and counts."""
+        at = self._size - len(MAGIC) - _FOOTER.size
+        file.seek(max(0, at))
+        footer = file.read(_FOOTER.size)
+        if len(footer) < _FOOTER.size or file.read() != MAGIC:
+            return
+        opcode, length, start, _, crc = _FOOTER.unpack(footer)
+        if (opcode, length) != (Opcode.FOOTER, _FOOTER.size - HEAD_BYTES) or not crc:
+            return
+        start = start or at  # no summary: the CRC is that of the footer alone
+        if not 0 <= at - start <= MAX_RECORD_BYTES:
+            return
+        file.seek(start)
+        summary = file.read(at - start)
+        if zlib.crc32(footer[:-4], zlib.crc32(summary)) != crc:
+            self.damage.add(start, 0, "the summary is damaged (wrong checksum)")
+            return
+        try:
+            self._note_summary(summary)
+        except Exception as error:  # noqa: BLE001 as above
+            self.damage.add(start, 0, f"the summary is damaged ({error})")
+
+    def _note_summary(self, summary: bytes) -> None:
+        for opcode, start, end in records_of(summary):
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                self._definitions.read(opcode, summary[start:end])
+            elif opcode == Opcode.STATISTICS:
+                self._statistics = Statistics.read(ReadDataStream(BytesIO(summary[start:end])))
 
     def _check_counts(self) -> None:
         """Holds what was read against what the file says it holds."""
-        if self._statistics is None:
+        statistics = self._statistics
+        if statistics is None or self._start:
             return
-        missing = self._statistics.message_count - self.num_messages
+        missing = statistics.message_count - self.num_messages
         if missing > 0:
             self.damage.lost_messages = missing
             self.damage.add(self._size, 0, f"{missing} messages that were written are missing")
+        elif missing < 0:
+            text = f"{-missing} messages more than were written: which ones cannot be told"
+            self.damage.add(self._size, 0, text)
+        if statistics.chunk_count != self.num_chunks:
+            text = f"{self.num_chunks} chunks of {statistics.chunk_count} that were written"
+            self.damage.add(self._size, 0, text)
 
 
-def _decompress(content: bytes) -> bytes:
-    """The records of a chunk, checked. Raises ValueError on a wrong size or CRC."""
-    _start, _end, size, crc = _CHUNK.unpack_from(content)
-    at = _CHUNK.size
-    (length,) = struct.unpack_from("<I", content, at)
-    compression = content[at + 4 : at + 4 + length].decode()
-    at += 4 + length
-    (num_bytes,) = struct.unpack_from("<Q", content, at)
-    body = content[at + 8 : at + 8 + num_bytes]
-    if size > MAX_CHUNK_BYTES:
-        raise ValueError(f"a chunk of {size} bytes, the limit is {MAX_CHUNK_BYTES}")
-    data = _inflate(compression, body, size)
-    if len(data) != size:
-        raise ValueError(f"{len(data)} bytes where {size} were declared")
-    if crc and zlib.crc32(data) != crc:
-        raise ValueError("wrong checksum")
-    return data
-
-
-def _inflate(compression: str, body: bytes, size: int) -> bytes:
-    """At most size + 1 bytes: a chunk that declares less than it holds is caught, not inflated."""
-    if compression == "":
-        return body
-    if compression == "lz4":
-        return bytes(lz4.frame.LZ4FrameDecompressor().decompress(body, max_length=size + 1))
-    if compression == "zstd":
-        with zstandard.ZstdDecompressor().stream_reader(body) as reader:
-            return reader.read(size + 1)
-    raise ValueError(f"unknown compression {compression!r}")
+def _begins_record(opcode: int, length: int) -> bool:
+    return (opcode in _KNOWN or opcode >= 0x80) and length < 1 << 40
 
 
 def _name(opcode: int) -> str:
