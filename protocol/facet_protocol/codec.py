@@ -37,6 +37,8 @@ from facet_protocol.messages import (
     Transforms,
 )
 from facet_protocol.proto import map_pb2, service_pb2
+from facet_protocol.ros import decode_ros_pose
+from facet_protocol.ros_definitions import ROS_SCHEMAS, definition
 from facet_protocol.topics import parse_scan_key
 
 Message = (
@@ -132,7 +134,10 @@ def decode(envelope: Envelope) -> Message:
     """The value in `envelope`. Raises ProtocolError, and nothing else, whatever the bytes.
 
     A scan takes robot and sensor from a native key, and the default reach; `decode_scan` is told.
+    Scans of ROS have no pose: they are for `decode_scan` alone.
     """
+    if envelope.encoding == "cdr":
+        return decode_ros_pose(envelope)
     row = SCHEMAS.get(envelope.schema)
     if row is None or envelope.encoding != "protobuf":
         text = f"schema {envelope.schema[:80]!r} in encoding {envelope.encoding[:20]!r}"
@@ -165,6 +170,13 @@ def descriptor_set(schema: str) -> bytes:
     if schema in _OUTPUT_ONLY:
         return _file_set(_OUTPUT_ONLY[schema])
     raise ProtocolError(f"schema {schema[:80]!r} is unknown", "unknown_schema")
+
+
+def schema_text(schema: str) -> tuple[str, bytes]:
+    """(encoding, data) of a schema as MCAP wants it. Raises ProtocolError when it is not known."""
+    if schema in ROS_SCHEMAS:
+        return "ros2msg", definition(schema).encode()
+    return "protobuf", descriptor_set(schema)
 
 
 def facet_descriptors() -> bytes:

@@ -17,6 +17,18 @@ class ProtocolError(ValueError):
         self.reason = reason
 
 
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """What a setting says about the messages of some keys; "" and 0 say nothing."""
+
+    key: str  # key expression: * is one chunk, ** any number of them
+    schema: str = ""  # where the message does not name its own
+    robot: str = ""
+    sensor: str = ""
+    frame: str = ""  # of a scan: the frame of its points; of a pose: the frame it is the pose of
+    envelope_field: int = 0  # the message is this field of another protobuf message
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class Envelope:
     """One message as it travelled: what the recorder writes and `decode` reads."""
@@ -29,6 +41,7 @@ class Envelope:
     epoch: int = 0  # a new one at each start of the publisher
     sequence: int = 0  # from 1; 0 means none
     received_ns: int = 0  # our clock, at the door
+    rule: Rule | None = None  # what the settings say about its key
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -117,6 +130,7 @@ class StampedTransform:
 @dataclass(frozen=True, slots=True, eq=False)
 class Transforms:
     transforms: tuple[StampedTransform, ...]
+    refused: tuple[str, ...] = ()  # reasons of those that were left out at decode
 
 
 @dataclass(frozen=True, slots=True, eq=False)

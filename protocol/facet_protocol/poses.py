@@ -79,5 +79,12 @@ def encode_transforms(value: Transforms) -> bytes:
 
 
 def decode_transforms(payload: bytes | memoryview) -> Transforms:
-    message = parse(FrameTransforms, payload)
-    return Transforms(tuple(_transform_of(t) for t in message.transforms))
+    """What is no good transform is left out, and its reason kept."""
+    good: list[StampedTransform] = []
+    refused: list[str] = []
+    for message in parse(FrameTransforms, payload).transforms:
+        try:
+            good.append(_transform_of(message))
+        except ProtocolError as error:
+            refused.append(error.reason)
+    return Transforms(tuple(good), tuple(refused))

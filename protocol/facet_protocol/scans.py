@@ -1,4 +1,4 @@
-"""Scans both ways: foxglove.PointCloud and foxglove.LaserScan, with the sensor's pose inside."""
+"""Scans: foxglove.PointCloud and LaserScan both ways, with the pose inside; those of ROS 2 in."""
 
 from __future__ import annotations
 
@@ -12,11 +12,13 @@ from facet_protocol.cloud import DATA_FIELD, pack_points, read_layout, read_poin
 from facet_protocol.messages import Envelope, LineFan, Pose, ProtocolError, Scan, ScanKind
 from facet_protocol.poses import pose_message, pose_of
 from facet_protocol.projection import MAX_ANGLE, count_ignored, project_fan
+from facet_protocol.ros_definitions import ROS_SCANS
+from facet_protocol.ros_scans import decode_ros_scan
 from facet_protocol.wire import parse, split_bytes_field, stamp_of, timestamp_of
 
 CLOUD_SCHEMA = "foxglove.PointCloud"
 FAN_SCHEMA = "foxglove.LaserScan"
-SCAN_SCHEMAS = (CLOUD_SCHEMA, FAN_SCHEMA)
+SCAN_SCHEMAS = (CLOUD_SCHEMA, FAN_SCHEMA, *ROS_SCANS)
 REACH_M = 8.0  # how far a line beam that came back empty counts as free, unless the map says so
 
 _IDENTITY = Pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
@@ -57,15 +59,22 @@ def decode_scan(
     """The scan in `envelope`; its points may be a view of the payload (see `read_points`).
 
     Raises ProtocolError: malformed, bad_layout, bad_pose, bad_quaternion, bad_stamp, wrong_frame
-    (when `frame_id` is given and differs), unknown_schema. With `pose_required` False a scan
-    without a pose is taken at its own frame's origin, for a caller that will place it.
+    (when `frame_id` is given and differs), bad_length, unknown_schema. With `pose_required` False a
+    scan without a pose, as ROS has them all, is taken at its own frame's origin, for a caller that
+    will place it.
     """
-    if envelope.schema == CLOUD_SCHEMA:
+    kind = (envelope.schema, envelope.encoding)
+    if kind == (CLOUD_SCHEMA, "protobuf"):
         return _decode_cloud(envelope, robot, sensor, frame_id, pose_required)
-    if envelope.schema == FAN_SCHEMA:
+    if kind == (FAN_SCHEMA, "protobuf"):
         fan, renormalised = _decode_fan(envelope, robot, sensor, frame_id, pose_required)
         return project(fan, reach_m, renormalised)
-    raise ProtocolError(f"{envelope.schema[:80]!r} is not the schema of a scan", "unknown_schema")
+    if envelope.schema in ROS_SCANS and envelope.encoding == "cdr":
+        if pose_required:
+            raise ProtocolError(f"{envelope.schema}: no pose", "bad_pose")
+        return decode_ros_scan(envelope, robot, sensor, reach_m)
+    text = f"schema {envelope.schema[:80]!r} in encoding {envelope.encoding[:20]!r}"
+    raise ProtocolError(f"{text} is not a scan", "unknown_schema")
 
 
 def _decode_cloud(

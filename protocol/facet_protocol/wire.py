@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from typing import TypeVar
 
 import numpy as np
@@ -60,6 +60,23 @@ def _skip(data: memoryview, position: int, wire_type: int) -> int:
     raise ProtocolError(f"wire type {wire_type} at byte {position}")
 
 
+def _top_fields(data: memoryview) -> Iterator[tuple[int, int, int, int]]:
+    """(start, tag, begin, end) of each top-level field: its value, with its length, is in
+    [begin, end)."""
+    position = 0
+    for _ in range(MAX_TOP_FIELDS):
+        if position >= len(data):
+            return
+        start = position
+        tag, begin = _varint(data, position)
+        position = _skip(data, begin, tag & 7)
+        if position > len(data):
+            raise ProtocolError(f"field {tag >> 3} ends at byte {position} of {len(data)}")
+        yield start, tag, begin, position
+    if position < len(data):
+        raise ProtocolError(f"more than {MAX_TOP_FIELDS} fields")
+
+
 def split_bytes_field(
     message_type: type[M], payload: bytes | memoryview, number: int
 ) -> tuple[M, memoryview]:
@@ -68,25 +85,26 @@ def split_bytes_field(
     Walks the top-level fields only; nothing of the field is copied. The last occurrence counts.
     """
     data = memoryview(payload).cast("B")
-    position, field = 0, memoryview(b"")
+    field = memoryview(b"")
     rest: list[memoryview] = []
-    for _ in range(MAX_TOP_FIELDS):
-        if position >= len(data):
-            break
-        start = position
-        tag, position = _varint(data, position)
-        begin, position = position, _skip(data, position, tag & 7)
-        if position > len(data):
-            raise ProtocolError(f"field {tag >> 3} ends at byte {position} of {len(data)}")
+    for start, tag, begin, end in _top_fields(data):
         if tag == (number << 3) | _BYTES:
-            length, begin = _varint(data, begin)
-            field = data[begin : begin + length]
+            field = data[_varint(data, begin)[1] : end]
         else:
-            rest.append(data[start:position])
-    else:
-        if position < len(data):
-            raise ProtocolError(f"more than {MAX_TOP_FIELDS} fields")
+            rest.append(data[start:end])
     return parse(message_type, b"".join(rest)), field
+
+
+def unwrap(payload: bytes | memoryview, number: int) -> memoryview:
+    """A view of bytes field `number` of any protobuf message: what an envelope holds."""
+    data = memoryview(payload).cast("B")
+    found: memoryview | None = None
+    for _, tag, begin, end in _top_fields(data):
+        if tag == (number << 3) | _BYTES:
+            found = data[_varint(data, begin)[1] : end]
+    if found is None:
+        raise ProtocolError(f"no field {number} in an envelope of {len(data)} bytes")
+    return found
 
 
 def finite(values: Iterable[float], num: int, name: str) -> NDArray[np.float64]:
@@ -122,11 +140,16 @@ def check_pose(position: Iterable[float], orientation_xyzw: Iterable[float]) -> 
 
 def stamp_of(timestamp: Timestamp) -> int:
     """int64 ns since the Unix epoch. Raises ProtocolError (bad_stamp) when it is not one."""
-    if not 0 <= timestamp.nanos < 1_000_000_000:
-        raise ProtocolError(f"stamp has {timestamp.nanos} nanoseconds", "bad_stamp")
-    stamp_ns = timestamp.seconds * 1_000_000_000 + timestamp.nanos
+    return stamp_of_parts(timestamp.seconds, timestamp.nanos)
+
+
+def stamp_of_parts(seconds: int, nanos: int) -> int:
+    """int64 ns since the Unix epoch. Raises ProtocolError (bad_stamp) when it is not one."""
+    if not 0 <= nanos < 1_000_000_000:
+        raise ProtocolError(f"stamp has {nanos} nanoseconds", "bad_stamp")
+    stamp_ns = seconds * 1_000_000_000 + nanos
     if not -(2**63) <= stamp_ns < 2**63:
-        raise ProtocolError(f"stamp of {timestamp.seconds} s does not fit 64 bits", "bad_stamp")
+        raise ProtocolError(f"stamp of {seconds} s does not fit 64 bits", "bad_stamp")
     return stamp_ns
 
 
