@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from facet.mapping.freespace import FreeSpace
 from facet.mapping.mapper import Mapper
-from facet.mapping.quantise import quantise
+from facet.mapping.settings import TICKS
 from facet_protocol.messages import Scan
 
 
@@ -39,8 +40,21 @@ def radii(mapper: Mapper) -> NDArray[np.int64]:
     return np.asarray(mapper._normals.normals.reach[: num_voxels(mapper)], np.int64)
 
 
-def num_ticks(mapper: Mapper, scan: Scan) -> int:
-    return len(quantise(scan, mapper.settings).points)
+def centroids(mapper: Mapper) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Exact centroids (V, 3) m of the occupied voxels, and unit vectors (V, 3) to the sensor."""
+    store, tick_m = mapper._store, mapper.settings.tick_m
+    rows = store.occupied_rows()
+    n = store.columns.moments[rows, :1].astype(np.float64)
+    local = store.columns.moments[rows, 1:4] / n + 0.5
+    corner = store.voxel_keys(rows).astype(np.float64) * TICKS
+    views = store.columns.views[rows].astype(np.float64)
+    views /= np.maximum(np.linalg.norm(views, axis=1, keepdims=True), 1e-9)
+    return (corner + local) * tick_m, views
+
+
+def free_space(mapper: Mapper) -> FreeSpace:
+    """What tells an opening from what was not observed."""
+    return mapper._free
 
 
 def free_bytes(mapper: Mapper) -> int:

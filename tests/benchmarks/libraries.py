@@ -81,6 +81,24 @@ def open3d_patches(cloud: Any, min_points: int) -> list[Any]:
     )
 
 
+def open3d_labels(boxes: list[Any], cloud: Cloud) -> NDArray[np.int32]:
+    """(V,) the patch of each voxel: the nearest plane of those whose box holds it in the plane,
+    within a voxel of it and 25 degrees of its normal. It hands out boxes, not their points."""
+    labels = np.full(len(cloud.centroids), -1, np.int32)
+    nearest = np.full(len(cloud.centroids), cloud.voxel_m)
+    for number, box in enumerate(boxes):
+        axes, half = np.asarray(box.R), np.asarray(box.extent) / 2.0
+        local = (cloud.centroids - np.asarray(box.center)) @ axes
+        thin = int(np.argmin(half))
+        off = np.abs(local[:, thin])
+        half[thin] = np.inf
+        agrees = np.abs(cloud.normals @ axes[:, thin]) >= np.cos(np.radians(MOST_NORMALS_DEG))
+        held = (np.abs(local) <= half + 0.5 * cloud.voxel_m).all(axis=1)
+        own = held & agrees & (off < nearest)
+        labels[own], nearest[own] = number, off[own]
+    return labels
+
+
 def cgal_points(cloud: Cloud) -> tuple[Any, Any]:
     """A Point_set_3 with normals, and the map of a shape a point: read from a file, as its Python
     has no arrays."""
@@ -134,7 +152,9 @@ def cgal_labels(points: Any, centroids: Float) -> NDArray[np.int32]:
         path = Path(folder) / "shapes.ply"
         points.write(str(path))
         _, _, body = path.read_bytes().partition(b"end_header\n")
-    found = np.frombuffer(body, row)
-    if not np.array_equal(found["xyz"], centroids):
-        raise RuntimeError("CGAL changed the order of the points")
-    return found["shape"].copy()
+    found, labels = np.frombuffer(body, row), np.empty(len(centroids), np.int32)
+    order, theirs = np.lexsort(centroids.T), np.lexsort(found["xyz"].T)  # RANSAC sorts them
+    if not np.array_equal(found["xyz"][theirs], centroids[order]):
+        raise RuntimeError("CGAL changed the points")
+    labels[order] = found["shape"][theirs]
+    return labels
