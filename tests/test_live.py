@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import threading
+import time
 from dataclasses import astuple
 from types import SimpleNamespace
 from typing import Any
 
 from facet.commands.play import RobotPublisher
 from facet.sources.live import Inbox, LiveSource, split_encoding
+from facet.status import Account
 from facet_protocol import attachment
 from facet_protocol.messages import Envelope
 from rig import room, service_and_client, wait_until
@@ -95,7 +98,7 @@ def test_without_an_attachment_there_is_no_sequence() -> None:
 
 
 def test_the_oldest_is_shed_and_remembered() -> None:
-    inbox = Inbox(3, 1 << 20, lambda: 42)
+    inbox = Inbox(3, 1 << 20, lambda: 42, patience_s=0.0)
     for sequence in range(1, 8):
         inbox.push(sample(sequence))
     assert [e.sequence for e in inbox.take(0.0, 1 << 20)] == [5, 6, 7]
@@ -105,21 +108,59 @@ def test_the_oldest_is_shed_and_remembered() -> None:
 
 
 def test_bytes_are_bounded_too() -> None:
-    inbox = Inbox(1000, 1000)
+    inbox = Inbox(1000, 1000, patience_s=0.0)
     for sequence in range(1, 21):
         inbox.push(sample(sequence, size=100))
         assert inbox.num_bytes <= 1000
+    assert [e.sequence for e in inbox.take(0.0, 450)] == [11, 12, 13, 14, 15]
     (loss,) = inbox.take_shed()
     assert (loss.first_sequence, loss.count) == (1, 10)
-    assert [e.sequence for e in inbox.take(0.0, 450)] == [11, 12, 13, 14, 15]
     assert len(inbox) == 5
     assert inbox.num_bytes == 500
 
 
 def test_one_huge_message_is_kept() -> None:
-    inbox = Inbox(10, 100)
+    inbox = Inbox(10, 100, patience_s=0.0)
     inbox.push(sample(1, size=500))
     assert len(inbox) == 1
+
+
+def test_half_full_the_network_waits_and_then_no_longer() -> None:
+    """F23: in sum `patience_s`, whichever thread it is, and again only after there was room."""
+    inbox = Inbox(8, 1 << 20, patience_s=0.4)
+    for sequence in (1, 2, 3, 4):
+        assert pushed(inbox, sequence) < 0.2
+    assert 0.3 < pushed(inbox, 5) < 2.0  # half full: no room came
+    assert pushed(inbox, 6) < 0.2
+    assert [e.sequence for e in inbox.take(0.0, 1 << 20)] == [1, 2, 3, 4, 5, 6]
+    for sequence in (7, 8, 9, 10):
+        assert pushed(inbox, sequence) < 0.2
+    taker = threading.Timer(0.05, inbox.take, (0.0, 1 << 20))
+    taker.start()
+    assert pushed(inbox, 11) < 0.35  # room came in time
+    taker.join()
+    assert len(inbox) == 1
+
+
+def pushed(inbox: Inbox, sequence: int) -> float:
+    """Seconds that the network had to wait."""
+    started = time.monotonic()
+    inbox.push(sample(sequence))
+    return time.monotonic() - started
+
+
+def test_what_is_too_large_does_not_come_in() -> None:
+    """F4, behind the transport's own limit: counted, not recorded, and no loss upstream."""
+    account = Account()
+    inbox = Inbox(10, 1 << 20, max_message_bytes=100, tally=account)
+    for sequence, size in ((1, 100), (2, 101), (3, 100)):
+        inbox.push(sample(sequence, size=size))
+    assert [e.sequence for e in inbox.take(0.0, 1 << 20)] == [1, 3]
+    assert [(x.first_sequence, x.count, x.reason) for x in inbox.take_shed()] == [
+        (2, 1, "too_large")
+    ]
+    assert account["too_large[r1/front]"] == 1
+    assert account.balance("r1/front").in_flight == 2
 
 
 def test_waiting_ends_when_it_is_woken() -> None:

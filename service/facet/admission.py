@@ -27,11 +27,11 @@ class Admission:
         try:
             scan = self._decode(envelope)
         except ProtocolError as error:
-            self._account.count(f"rejected.{error.reason}", source)
+            self._account.settle(source, f"rejected.{error.reason}")
             self._account.complain(source, error.reason, str(error))
             return None
         if not self._is_first(envelope, scan.source):
-            self._account.count("duplicate", source)
+            self._account.settle(source, "duplicate")
             return None
         if scan.renormalised:
             self._account.count("renormalised", source)
@@ -45,7 +45,7 @@ class Admission:
 
     def _is_first(self, envelope: Envelope, source: str) -> bool:
         if envelope.sequence:
-            return self._applied.note(source, envelope.epoch, envelope.sequence)[0]
+            return self._applied.note(source, envelope.epoch, envelope.sequence).is_new
         stamp = envelope.stamp_ns.to_bytes(8, "little", signed=True)
         digest = hashlib.blake2b(source.encode() + stamp, digest_size=16)
         digest.update(envelope.payload)

@@ -122,23 +122,30 @@ class Credentials(Section):
 
 
 class QueueSection(Section):
-    """How much may wait between the network and the log; the oldest is shed, and counted."""
+    """How much may wait between the network and the log. Half full, the network waits for a while;
+    full, the oldest is shed, and counted."""
 
     max_messages: int = Field(default=8192, ge=1, le=1_000_000)
     max_bytes: int = Field(default=256 * MIB, ge=MIB, le=65536 * MIB)
+    patience_s: float = Field(default=2.0, ge=0.0, le=4.0)  # Zenoh cuts a link that waits for 5
 
 
 class RecordSection(Section):
     """The log: what is not in it is not in the map."""
 
     directory: Path = Path("out/log")
+    # durable: what is acknowledged survives a power cut; fast: the end of this process only
+    mode: Literal["durable", "fast"] = "durable"
     commit_ms: int = Field(default=50, ge=1, le=1000)
     compression: Literal["lz4", "zstd", "none"] = "lz4"
     max_file_bytes: int = Field(default=1024 * MIB, ge=MIB)
     max_file_s: int = Field(default=3600, ge=1)
-    min_free_bytes: int = Field(default=1024 * MIB, ge=0)
+    # bytes left to others; None: 1 GiB, or 2 % of the disk if that is more
+    min_free_bytes: int | None = Field(default=None, ge=0)
     retry_s: float = Field(default=5.0, gt=0.0, le=600.0)
     on_full: Literal["retry", "exit"] = "retry"
+    resume: bool = True  # go on with the map whose log lies in the directory
+    checkpoint_s: float = Field(default=60.0, ge=0.0)  # 0: only at the end, and when asked
 
 
 class PublishSection(Section):

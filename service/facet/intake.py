@@ -6,11 +6,12 @@ import logging
 import threading
 import time
 from collections import deque
+from collections.abc import Iterable
 
 from facet.outgoing import Outgoing
 from facet.sequences import SequenceLedger
 from facet.sinks import Message
-from facet.sinks.recorder import Recorder
+from facet.sinks.recorder import LogPosition, Recorder
 from facet.sources.live import Inbox, loss_of
 from facet.sources.naming import source_of
 from facet.status import Account
@@ -29,6 +30,8 @@ class DurableQueue:
         self._max_bytes = max_bytes
         self._num_bytes = 0
         self._waiting: deque[Envelope] = deque()
+        self._end: LogPosition | None = None  # of what waits
+        self.taken_to: LogPosition | None = None  # all that lies before it in the log was taken
         self._changed = threading.Condition()
         self._closed = False
 
@@ -39,9 +42,11 @@ class DurableQueue:
     def has_room(self) -> bool:
         return self._num_bytes < self._max_bytes
 
-    def put(self, envelopes: list[Envelope]) -> None:
+    def put(self, envelopes: list[Envelope], end: LogPosition | None = None) -> None:
+        """Hand on what the log holds up to `end`."""
         with self._changed:
             self._waiting.extend(envelopes)
+            self._end = end
             self._num_bytes += sum(len(e.payload) for e in envelopes)
             self._changed.notify_all()
 
@@ -52,6 +57,7 @@ class DurableQueue:
             taken = list(self._waiting)
             self._waiting.clear()
             self._num_bytes = 0
+            self.taken_to = self._end
             self._changed.notify_all()
         return taken
 
@@ -99,6 +105,12 @@ class Intake:
 
     def start(self) -> None:
         self._thread.start()
+
+    def expect(self, newest: Iterable[tuple[str, int, int]]) -> None:
+        """Before the start: (source, epoch, sequence) that the log ends with, so that what was
+        sent while no service was there is seen to be missing."""
+        for source, epoch, sequence in newest:
+            self._ledger.note(source, epoch, sequence)
 
     def write(self, envelope: Envelope, message: Message | None) -> None:
         """Queue one of our own messages for the log; scans are in it already."""
@@ -152,9 +164,10 @@ class Intake:
 
     def _take(self, timeout_s: float) -> None:
         """From the inbox and from ourselves into the recorder, counted."""
-        for envelope in self._inbox.take(timeout_s, BATCH_BYTES):
-            for loss in self._inbox.take_shed():
-                self._lose(loss)
+        taken = self._inbox.take(timeout_s, BATCH_BYTES)
+        for loss in self._inbox.take_shed():
+            self._lose(loss)
+        for envelope in taken:
             self._note(envelope)
             self._recorder.write(envelope)
             self._scans.append(envelope)
@@ -162,28 +175,42 @@ class Intake:
             self._recorder.write(self._derived.popleft())
 
     def _note(self, envelope: Envelope) -> None:
-        """Count one message that came, and what is missing right before it."""
+        """What the number of one message tells: a gap before it, a restart, a late arrival."""
         source = source_of(envelope.key)
-        self._account.count("received", source)
-        _, skipped = self._ledger.note(source, envelope.epoch, envelope.sequence)
-        if skipped:
-            first = envelope.sequence - skipped
-            self._log_loss(loss_of(envelope, first, skipped, "lost_upstream"))
+        noted = self._ledger.note(source, envelope.epoch, envelope.sequence)
+        if noted.skipped:
+            self._log_loss(loss_of(envelope, noted.first_skipped, noted.skipped, "lost_upstream"))
+        if noted.is_late:
+            self._account.count("recovered_late", source)
+            self._write_loss(loss_of(envelope, envelope.sequence, 1, "recovered_late"))
+        if noted.is_restart:
+            self._account.count("source_restarted", source)
+            logger.info("%s: has begun anew, epoch %d", source, envelope.epoch)
+        if noted.is_interleaved:
+            self._account.count("duplicate_publisher", source)
+            text = f"epochs alternate ({envelope.epoch}): two publishers share the name"
+            self._account.complain(source, "duplicate_publisher", text)
+        self._say_missing(source)
+
+    def _say_missing(self, source: str) -> None:
+        missing = self._ledger.missing(source)[source]
+        self._account.set_counter("lost_upstream", missing, source)
         self._account.set_counter("lost_upstream", sum(self._ledger.missing().values()))
 
     def _lose(self, loss: Loss) -> None:
         """What the inbox had to drop did arrive: it is no loss upstream."""
         source = f"{loss.robot}/{loss.sensor}"
-        self._account.count("received", source, loss.count)
-        self._account.count(loss.reason, source, loss.count)
         if loss.first_sequence:
             for sequence in range(loss.first_sequence, loss.first_sequence + loss.count):
                 self._ledger.note(source, loss.epoch, sequence)
         self._log_loss(loss)
 
-    def _log_loss(self, loss: Loss) -> None:
+    def _write_loss(self, loss: Loss) -> None:
         envelope, _ = self._outgoing.loss(loss)
         self._recorder.write(envelope)
+
+    def _log_loss(self, loss: Loss) -> None:
+        self._write_loss(loss)
         text = f"{loss.count} scans from sequence {loss.first_sequence}"
         self._account.complain(f"{loss.robot}/{loss.sensor}", loss.reason, text)
 
@@ -213,7 +240,7 @@ class Intake:
             self._account.count("recorded", source)
             self._account.gauge("ack", envelope.sequence, source)
         if scans:
-            self._durable.put(scans)
+            self._durable.put(scans, self._recorder.position)
 
     def _fail(self, error: OSError) -> None:
         self._account.failure = str(error)
@@ -230,5 +257,6 @@ class Intake:
         except OSError as error:
             lost = self._recorder.forget()
             self._account.failure = str(error)
-            self._account.count("unrecorded", num=len(self._scans))
+            for envelope in self._scans:
+                self._account.settle(source_of(envelope.key), "unrecorded")
             logger.error("%d messages could not be recorded: %s", len(lost), error)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -120,12 +121,12 @@ class Pipeline:
                 sink.write(envelope, message)
 
     def _count(self, scan: Scan, points_stored: int, rejected: dict[str, int]) -> None:
-        count = self._account.count
-        count("applied", scan.source)
-        count("points_in", scan.source, len(scan.points))
-        count("points_stored", scan.source, points_stored)
-        for reason, num in rejected.items():
-            count(f"points_rejected.{reason}", "", num)
+        """One instant for a scan and all its points: points in = stored + rejected."""
+        lost = Counter(rejected) + Counter(scan.ignored)
+        points = {f"points_rejected.{reason}": num for reason, num in lost.items()}
+        points["points_in"] = len(scan.points) + sum(scan.ignored.values())
+        points["points_stored"] = points_stored
+        self._account.settle(scan.source, "applied", also=points)
 
 
 class Stopwatch:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections import defaultdict
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 
 @dataclass(slots=True)
@@ -54,27 +55,48 @@ class Numbers:
         return self.last - self.first + 1 - len(self) if self.starts else 0
 
 
+class Noted(NamedTuple):
+    """What a sequence number tells about its source."""
+
+    is_new: bool  # False: it has come before
+    skipped: int = 0  # how many are found missing by it: a range that starts at
+    first_skipped: int = 0  # this number
+    is_late: bool = False  # it fills a gap that was counted
+    is_restart: bool = False  # the publisher has begun anew
+    is_interleaved: bool = False  # an epoch that had ended goes on: two publishers, one name
+
+
 class SequenceLedger:
     """What has come from every source, by epoch. A sequence of 0 says nothing and is not kept."""
 
     def __init__(self) -> None:
         self._seen: defaultdict[str, dict[int, Numbers]] = defaultdict(dict)
+        self._current: dict[str, int] = {}  # the epoch of the last message
+        self._skipped: Counter[str] = Counter()
+        self._late: Counter[str] = Counter()
 
-    def note(self, source: str, epoch: int, sequence: int) -> tuple[bool, int]:
-        """(is new, how many were skipped right before it). A new epoch skips nothing."""
+    def note(self, source: str, epoch: int, sequence: int) -> Noted:
+        """Take one number. A new epoch skips nothing: what it began with is not known."""
         if sequence == 0:
-            return True, 0
-        numbers = self._seen[source].setdefault(epoch, Numbers())
-        last = numbers.last
+            return Noted(True)
+        epochs = self._seen[source]
+        is_restart = bool(epochs) and epoch not in epochs
+        is_interleaved = epoch in epochs and epoch != self._current[source]
+        self._current[source] = epoch
+        numbers = epochs.setdefault(epoch, Numbers())
+        first, last = numbers.first, numbers.last
         is_new = numbers.add(sequence)
-        return is_new, max(0, sequence - last - 1) if last else 0
+        start, end = (sequence, first) if sequence < first else (last or sequence, sequence)
+        skipped = max(0, end - start - 1)
+        is_late = is_new and first < sequence < last
+        self._skipped[source] += skipped
+        self._late[source] += is_late
+        return Noted(is_new, skipped, start + 1, is_late, is_restart, is_interleaved)
 
-    def missing(self) -> dict[str, int]:
+    def missing(self, source: str | None = None) -> dict[str, int]:
         """Numbers that have not come, by source; a late arrival takes one away again."""
-        return {
-            source: sum(numbers.missing for numbers in epochs.values())
-            for source, epochs in sorted(self._seen.items())
-        }
+        sources = sorted(self._skipped) if source is None else [source]
+        return {s: self._skipped[s] - self._late[s] for s in sources}
 
     def num_epochs(self) -> dict[str, int]:
         return {source: len(epochs) for source, epochs in sorted(self._seen.items())}

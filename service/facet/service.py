@@ -29,6 +29,7 @@ from facet.sinks.publisher import Publisher
 from facet.sinks.recorder import Recorder
 from facet.sinks.snapshots import Snapshots
 from facet.sources.live import Inbox, LiveSource
+from facet.sources.naming import source_of
 from facet.status import Account
 
 logger = logging.getLogger(__name__)
@@ -53,7 +54,13 @@ class Service:
     def __init__(self, session: zenoh.Session, config: Config, mapper: Mapper) -> None:
         self.account = Account()
         self._session, self._config, self._mapper = session, config, mapper
-        self._inbox = Inbox(config.queue.max_messages, config.queue.max_bytes)
+        self._inbox = Inbox(
+            config.queue.max_messages,
+            config.queue.max_bytes,
+            max_message_bytes=config.network.max_message_bytes,
+            patience_s=config.queue.patience_s,
+            tally=self.account,
+        )
         self._durable = DurableQueue(config.queue.max_bytes)
         self._outgoing = Outgoing(config.map.id, config.map.frame, time.time_ns)
         self.recorder = _recorder(config, mapper)
@@ -145,7 +152,7 @@ class Service:
         started = time.monotonic()
         for envelope in self._durable.take(timeout_s):
             if time.monotonic() > self._stop_at:
-                self.account.count("not_applied")
+                self.account.settle(source_of(envelope.key), "not_applied")
                 continue
             self._pipeline.insert(envelope)
         if self._pipeline.is_stale and time.monotonic() <= self._stop_at:

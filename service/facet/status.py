@@ -1,4 +1,8 @@
-"""The service's account of itself: counters that only grow, gauges, stage times, health."""
+"""The service's account of itself: counters that only grow, gauges, stage times, health.
+
+The law of it, at every instant, for each source and for all of them:
+received = applied + rejected (by reason) + left out (by cause) + in flight.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +12,7 @@ import time
 from collections import Counter
 from collections.abc import Mapping
 from contextlib import suppress
+from dataclasses import dataclass
 
 from facet_protocol.messages import Status
 
@@ -16,6 +21,59 @@ logger = logging.getLogger(__name__)
 MAX_SOURCES = 256  # sources counted by name; a stranger cannot make the account grow for ever
 BURST_S = 10.0  # one line of log per source and reason in this time
 
+# Why a good message is not applied: it was there already; another with its number was chosen; the
+# queue, the disk or the time did not suffice for it.
+LEFT_OUT = ("duplicate", "conflict", "shed_overload", "too_large", "unrecorded", "not_applied")
+
+
+@dataclass(frozen=True, slots=True)
+class Balance:
+    """What became of the messages of one source, or of all, and of the points of the applied."""
+
+    received: int
+    applied: int
+    rejected: int
+    left_out: int
+    in_flight: int  # between the door and the map
+    points_in: int
+    points_stored: int
+    points_rejected: int
+
+    @property
+    def is_exact(self) -> bool:
+        """Nothing was lost in silence, and nothing counted twice."""
+        settled = self.applied + self.rejected + self.left_out
+        points = self.points_stored + self.points_rejected
+        return self.received == settled + self.in_flight >= settled and self.points_in == points
+
+
+def balance_of(
+    counters: Mapping[str, int], gauges: Mapping[str, float], source: str = ""
+) -> Balance:
+    """The balance in a status; of all sources together when none is named."""
+    tail = f"[{source}]" if source else ""
+
+    def count(name: str) -> int:
+        return counters.get(name + tail, 0)
+
+    def count_all(prefix: str) -> int:
+        return sum(
+            num
+            for name, num in counters.items()
+            if name.startswith(prefix) and (name.endswith(tail) if tail else "[" not in name)
+        )
+
+    return Balance(
+        received=count("received"),
+        applied=count("applied"),
+        rejected=count_all("rejected."),
+        left_out=sum(count(name) for name in LEFT_OUT),
+        in_flight=int(gauges.get("in_flight" + tail, 0)),
+        points_in=count("points_in"),
+        points_stored=count("points_stored"),
+        points_rejected=count_all("points_rejected."),
+    )
+
 
 class Account:
     """Counters and gauges of every thread; the one place where they meet."""
@@ -23,6 +81,7 @@ class Account:
     def __init__(self) -> None:
         self._lock = threading.Lock()
         self._counters: Counter[str] = Counter()
+        self._in_flight: Counter[str] = Counter()  # by source
         self._sources: set[str] = set()
         self._gauges: dict[str, float] = {}
         self._stage_ms: dict[str, float] = {}
@@ -32,16 +91,38 @@ class Account:
 
     def count(self, name: str, source: str = "", num: int = 1) -> None:
         """Add to a counter, and to the source's own."""
-        if num == 0:
-            return
         with self._lock:
-            self._counters[name] += num
-            if source:
-                self._counters[f"{name}[{self._known(source)}]"] += num
+            self._add(name, source, num)
 
-    def set_counter(self, name: str, value: int) -> None:
+    def arrive(self, source: str, num: int = 1) -> None:
+        """Messages have come in: they are in flight until each is settled."""
         with self._lock:
-            self._counters[name] = value
+            self._add("received", source, num)
+            self._in_flight[self._known(source)] += num
+
+    def settle(
+        self, source: str, outcome: str, num: int = 1, also: Mapping[str, int] | None = None
+    ) -> None:
+        """Messages of `source` are no longer in flight: `applied`, `rejected.<reason>`, or one of
+        LEFT_OUT. `also` are counters that move in the same instant: those of their points."""
+        with self._lock:
+            self._in_flight[self._known(source)] -= num
+            for name, more in {outcome: num, **(also or {})}.items():
+                self._add(name, source, more)
+
+    def balance(self, source: str = "") -> Balance:
+        """As it stands at this instant."""
+        with self._lock:
+            return balance_of(self._counters, self._flights(), source)
+
+    def sources(self) -> list[str]:
+        """Every source that was counted by name."""
+        with self._lock:
+            return sorted(self._sources)
+
+    def set_counter(self, name: str, value: int, source: str = "") -> None:
+        with self._lock:
+            self._counters[f"{name}[{self._known(source)}]" if source else name] = value
 
     def gauge(self, name: str, value: float, source: str = "") -> None:
         """Set a gauge; one of a source is kept under the source's name."""
@@ -80,9 +161,21 @@ class Account:
                 stamp_ns=stamp_ns,
                 health=self._health(),
                 counters={name: num for name, num in sorted(self._counters.items()) if num > 0},
-                gauges=dict(sorted({**self._gauges, "rss_mb": _rss_mb()}.items())),
+                gauges=dict(
+                    sorted({**self._gauges, **self._flights(), "rss_mb": _rss_mb()}.items())
+                ),
                 stage_ms=dict(self._stage_ms),
             )
+
+    def _add(self, name: str, source: str, num: int) -> None:
+        if num:
+            self._counters[name] += num
+            if source:
+                self._counters[f"{name}[{self._known(source)}]"] += num
+
+    def _flights(self) -> dict[str, float]:
+        by_source = {f"in_flight[{s}]": float(n) for s, n in self._in_flight.items() if n}
+        return {"in_flight": float(sum(self._in_flight.values())), **by_source}
 
     def _health(self) -> str:
         if self.failure:
@@ -91,7 +184,7 @@ class Account:
 
     def _known(self, source: str) -> str:
         if source not in self._sources and len(self._sources) >= MAX_SOURCES:
-            return "others"
+            source = "others"
         self._sources.add(source)
         return source
 

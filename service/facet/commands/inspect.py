@@ -52,7 +52,7 @@ class Contents:
         if is_scan(envelope):
             source = source_of(envelope.key)
             self.scans[source] += 1
-            if not self.ledger.note(source, envelope.epoch, envelope.sequence)[0]:
+            if not self.ledger.note(source, envelope.epoch, envelope.sequence).is_new:
                 self.duplicates[source] += 1
         elif envelope.key in (topics.CUT_TOPIC, topics.LOSS_TOPIC):
             self._note_own(envelope)

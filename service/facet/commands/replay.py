@@ -26,7 +26,7 @@ from facet.config import Config, load_config
 from facet.cuts import logged_cuts, timed_cuts
 from facet.outgoing import Outgoing
 from facet.sinks import Sink
-from facet.sources.naming import is_scan
+from facet.sources.naming import is_scan, source_of
 from facet.sources.recording import Recording, is_replayed, paced
 from facet.status import Account
 from facet_protocol.messages import Envelope
@@ -107,6 +107,7 @@ def replay_log(
     num = 0
     for batch in _batches(envelopes, update_every, recording):
         for envelope in batch:
+            account.arrive(source_of(envelope.key))
             pipeline.insert(envelope)
             num += 1
             on_scan(num)

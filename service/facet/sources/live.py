@@ -7,11 +7,12 @@ import time
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import zenoh
 import zenoh.ext
 
-from facet.sources.naming import robot_and_sensor
+from facet.sources.naming import robot_and_sensor, source_of
 from facet_protocol import attachment
 from facet_protocol.messages import Envelope, Loss, ProtocolError
 from facet_protocol.topics import scans_key
@@ -26,18 +27,37 @@ class Waiting:
     num_bytes: int
 
 
+class Tally(Protocol):
+    """Who counts what comes in, and what does not get any further."""
+
+    def arrive(self, source: str) -> None: ...
+
+    def settle(self, source: str, outcome: str) -> None: ...
+
+
 class Inbox:
-    """Bounded by messages and by bytes; when full, the oldest goes and is remembered as shed."""
+    """Bounded by messages and by bytes. Half full, the network has to wait, `patience_s` at most:
+    Zenoh cuts a link that waits for five; full, the oldest goes and is remembered as shed."""
 
     def __init__(
-        self, max_messages: int, max_bytes: int, clock_ns: Callable[[], int] = time.time_ns
+        self,
+        max_messages: int,
+        max_bytes: int,
+        clock_ns: Callable[[], int] = time.time_ns,
+        *,
+        max_message_bytes: int = 1 << 62,
+        patience_s: float = 2.0,
+        tally: Tally | None = None,
     ) -> None:
         self.num_received = 0
         self.num_bytes = 0
         self._max_messages, self._max_bytes = max_messages, max_bytes
-        self._clock_ns = clock_ns
+        self._max_message_bytes, self._patience_s = max_message_bytes, patience_s
+        self._clock_ns, self._tally = clock_ns, tally
         self._waiting: deque[Waiting] = deque()
         self._shed: list[Loss] = []
+        self._shed_before: list[Loss] = []  # of what the last `take` took
+        self._hold_until: float | None = None  # monotonic s: the network waits no longer
         self._changed = threading.Condition()
         self._closed = False
 
@@ -45,17 +65,25 @@ class Inbox:
         return len(self._waiting)
 
     def push(self, sample: zenoh.Sample) -> None:
-        """Called on Zenoh's threads: appends, and no more."""
+        """Called on Zenoh's threads: appends, and may hold them back for a while."""
         waiting = Waiting(sample, self._clock_ns(), len(sample.payload))
         with self._changed:
             self.num_received += 1
+            if self._tally is not None:
+                self._tally.arrive(source_of(str(sample.key_expr)))
+            if waiting.num_bytes > self._max_message_bytes:
+                self._drop(waiting, "too_large")
+                return
+            self._hold_back()
             self.num_bytes += waiting.num_bytes
             self._waiting.append(waiting)
             while len(self._waiting) > self._max_messages or self.num_bytes > self._max_bytes:
                 if len(self._waiting) == 1:
                     break  # a single message is never too many
-                self._shed_oldest()
-            self._changed.notify()
+                oldest = self._waiting.popleft()
+                self.num_bytes -= oldest.num_bytes
+                self._drop(oldest, "shed_overload")
+            self._changed.notify_all()
 
     def take(self, timeout_s: float, max_bytes: int) -> list[Envelope]:
         """What waits, oldest first, up to `max_bytes`; waits up to `timeout_s` for the first."""
@@ -67,19 +95,38 @@ class Inbox:
                 taken.append(self._waiting.popleft())
                 num_bytes += taken[-1].num_bytes
             self.num_bytes -= num_bytes
+            self._shed_before += self._shed
+            self._shed = []
+            self._changed.notify_all()
         return [envelope_of(w, w.sample.payload.to_bytes()) for w in taken]
 
     def take_shed(self) -> list[Loss]:
-        """What had to go since the last call: ranges of sequence numbers."""
+        """What had to go before that which was taken last: ranges of sequence numbers."""
         with self._changed:
-            shed, self._shed = self._shed, []
+            shed, self._shed_before = self._shed_before, []
         return shed
 
-    def _shed_oldest(self) -> None:
-        oldest = self._waiting.popleft()
-        self.num_bytes -= oldest.num_bytes
-        envelope = envelope_of(oldest, b"")
-        loss = loss_of(envelope, envelope.sequence, 1, "shed_overload")
+    @property
+    def is_half_full(self) -> bool:
+        return 2 * len(self._waiting) >= self._max_messages or 2 * self.num_bytes >= self._max_bytes
+
+    def _hold_back(self) -> None:
+        """Wait for room, but in sum no longer than `patience_s` since the queue was half full."""
+        if self.is_half_full:
+            now = time.monotonic()
+            if self._hold_until is None:
+                self._hold_until = now + self._patience_s
+            self._changed.wait_for(
+                lambda: self._closed or not self.is_half_full, max(0.0, self._hold_until - now)
+            )
+        if not self.is_half_full:
+            self._hold_until = None
+
+    def _drop(self, waiting: Waiting, reason: str) -> None:
+        envelope = envelope_of(waiting, b"")
+        if self._tally is not None:
+            self._tally.settle(source_of(envelope.key), reason)
+        loss = loss_of(envelope, envelope.sequence, 1, reason)
         last = self._shed[-1] if self._shed else None
         if last is not None and _continues(last, loss):
             self._shed[-1] = replace(last, count=last.count + 1, stamp_ns=loss.stamp_ns)
@@ -87,7 +134,7 @@ class Inbox:
             self._shed.append(loss)
 
     def wake(self) -> None:
-        """No one waits any longer for a first message."""
+        """No one waits any longer for a first message, or for room."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
@@ -137,7 +184,8 @@ def loss_of(envelope: Envelope, first_sequence: int, count: int, reason: str) ->
 
 
 def _continues(last: Loss, loss: Loss) -> bool:
-    same = (last.robot, last.sensor, last.epoch) == (loss.robot, loss.sensor, loss.epoch)
+    names = [(x.robot, x.sensor, x.epoch, x.reason) for x in (last, loss)]
+    same = names[0] == names[1]
     follows = loss.first_sequence == (
         last.first_sequence + last.count if loss.first_sequence else 0
     )
