@@ -23,12 +23,18 @@ ChannelName = tuple[str, str, str, int, int]  # topic, schema, encoding, epoch, 
 
 
 class LogFile:
-    """Chunks with CRCs, a summary at the end; what was added is durable after `sync`."""
+    """Chunks with CRCs, a summary at the end; what was added is durable after `sync`, or, if the
+    file does not wait for the disk, with the system."""
 
     def __init__(
-        self, file: DurableFile, metadata: Mapping[str, str], compression: str = "lz4"
+        self,
+        file: DurableFile,
+        metadata: Mapping[str, str],
+        compression: str = "lz4",
+        waits: bool = True,
     ) -> None:
-        self._file = file
+        self.channel_names: list[ChannelName] = []  # number 1 first; it only grows
+        self._file, self._waits = file, waits
         self._schemas: dict[str, int] = {}
         self._channels: dict[ChannelName, int] = {}
         self._writer = Writer(
@@ -38,6 +44,10 @@ class LogFile:
         )
         self._writer.start(profile="", library="facet")
         self._writer.add_metadata("facet", signed(metadata))
+
+    @property
+    def path(self) -> Path:
+        return self._file.path
 
     @property
     def num_bytes(self) -> int:
@@ -60,12 +70,12 @@ class LogFile:
     def sync(self) -> None:
         """Close the chunk in progress and wait for the disk. Raises OSError."""
         self._writer.flush()
-        self._file.sync()
+        self._file.sync(self._waits)
 
     def finish(self) -> None:
         """Write the summary and close the file. Raises OSError."""
         self._writer.finish()
-        self._file.sync()
+        self._file.sync(self._waits)
         self._file.close()
 
     def abandon(self) -> None:
@@ -77,13 +87,11 @@ class LogFile:
         high = envelope.sequence >> 32  # MCAP counts in 32 bits
         name = (envelope.key, envelope.schema, envelope.encoding, envelope.epoch, high)
         if name not in self._channels:
-            metadata = {"epoch": str(envelope.epoch)} if envelope.epoch else {}
-            if high:
-                metadata["sequence_high"] = str(high)
             schema = self._schema(envelope.schema) if envelope.schema else 0
             self._channels[name] = self._writer.register_channel(
-                envelope.key, envelope.encoding, schema, metadata
+                envelope.key, envelope.encoding, schema, channel_metadata(name)
             )
+            self.channel_names.append(name)
         return self._channels[name]
 
     def _schema(self, name: str) -> int:
@@ -94,6 +102,13 @@ class LogFile:
                 encoding, data = "", b""
             self._schemas[name] = self._writer.register_schema(name, encoding, data)
         return self._schemas[name]
+
+
+def channel_metadata(name: ChannelName) -> dict[str, str]:
+    """What a channel says beside its topic: the epoch, and what MCAP's 32 bits lack."""
+    _topic, _schema, _encoding, epoch, high = name
+    metadata = {"epoch": str(epoch)} if epoch else {}
+    return {**metadata, "sequence_high": str(high)} if high else metadata
 
 
 def write_recording(

@@ -102,6 +102,7 @@ class McapStream:
         self._statistics: Statistics | None = None
         self._size = 0
         self._has_lost_chunk = False  # the one just before
+        self._search_from = start  # behind the last record whose length is known to be right
         self._crc: int | None = 0  # of the file so far, while it has no chunks, and was all read
 
     def messages(self) -> Iterator[LogMessage]:
@@ -177,6 +178,7 @@ class McapStream:
             return (yield from self._salvage(file, at, reason))
         if opcode != Opcode.ATTACHMENT:
             self._lose(at, end - at, f"{_name(opcode)} of {end - at} bytes is too long to be read")
+        self._search_from = end
         return end
 
     def _chunk(self, file: BinaryIO, at: int, opcode: int, content: bytes) -> Reading:
@@ -189,17 +191,19 @@ class McapStream:
             reason = f"a chunk is damaged ({error})"
             if is_chunk(content) and self._is_followed(file, end, opcode):
                 self._lose(at, end - at, reason)
+                self._search_from = end
                 return end
             return (yield from self._salvage(file, at, reason))
         if opcode != Opcode.CHUNK:
             self.damage.add(at, 0, f"a chunk was marked as {_name(opcode)}")
         yield from self._messages(data, is_checked=bool(chunk.crc))
-        is_followed = self._is_followed(file, end, opcode)
-        return end if is_followed else at + HEAD_BYTES + chunk.end
+        self._search_from = at + HEAD_BYTES + chunk.end
+        return end if self._is_followed(file, end, opcode) else self._search_from
 
     def _salvage(self, file: BinaryIO, at: int, reason: str) -> Reading:
-        """Go on at the next good chunk: all before it is lost."""
-        start = at
+        """Go on at the next good chunk: all before it is lost. A wrong length may have led past
+        one: it is searched for from further back."""
+        start = self._search_from
         while (found := find_chunk(file, start, self._size)) is not None:
             offset, chunk, data = found
             try:
@@ -209,7 +213,8 @@ class McapStream:
                 continue
             self._lose(at, max(0, offset - HEAD_BYTES - at), reason)
             yield from self._messages(data, is_checked=True)
-            return offset + chunk.end
+            self._search_from = offset + chunk.end
+            return self._search_from
         self._lose(at, self._size - at, reason)
         return self._size
 
