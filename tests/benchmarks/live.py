@@ -99,7 +99,7 @@ def simulate_laps(folder: Path) -> list[Path]:
 
 
 @contextmanager
-def service(endpoint: str, log: Path) -> Iterator[None]:
+def service(endpoint: str, log: Path) -> Iterator[subprocess.Popen[str]]:
     """`facet run` with recorder and publisher, ready; must end cleanly."""
     command = facet("run", "--listen", endpoint, "--record", log, "--viewer", "off")
     child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
@@ -109,7 +109,7 @@ def service(endpoint: str, log: Path) -> Iterator[None]:
         while "ready" not in child.stderr.readline():
             if child.poll() is not None or time.monotonic() > deadline:
                 raise RuntimeError("the service did not start")
-        yield
+        yield child
     finally:
         child.send_signal(signal.SIGTERM)
         _, rest = child.communicate(timeout=30)
@@ -117,7 +117,7 @@ def service(endpoint: str, log: Path) -> Iterator[None]:
         out.print(f"the service ended with {child.returncode}:\n{rest}", markup=False)
 
 
-def play(path: Path, endpoint: str, speed: float) -> None:
+def play(path: Path, endpoint: str, speed: float | str) -> None:
     command = facet("play", path, "--connect", endpoint, "--speed", speed)
     subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
     time.sleep(SETTLE_S)
@@ -163,7 +163,7 @@ def ripeness(journal: Journal, lap: Lap) -> float:
     return before[-1].counters.get("points_stored", 0) / before[-1].gauges["voxels"]
 
 
-def judge(journal: Journal, num_played: int) -> list[Figure]:
+def judge(journal: Journal, num_played: int, limit_ms: float = LIMIT_MS) -> list[Figure]:
     last = journal.statuses[-1][1].counters
     applied = sum(lap.applied for lap in journal.laps.values())
     received = sum(len(lap.received) for lap in journal.laps.values())
@@ -177,7 +177,7 @@ def judge(journal: Journal, num_played: int) -> list[Figure]:
     for name, lap in (("exploring", first), ("mapped", mapped)):
         ms = lap.latencies_ms()
         p50, p95, p99 = np.percentile(ms, [50, 95, 99]).tolist()
-        limited = at_most(f"{name}: latency p95", p95, LIMIT_MS, "ms")
+        limited = at_most(f"{name}: latency p95", p95, limit_ms, "ms")
         figures += [
             Figure(f"{name}: scans", len(ms)),
             Figure(f"{name}: updates a second", len(lap.cuts) / lap.seconds),
