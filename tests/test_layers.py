@@ -31,7 +31,8 @@ class Layer(NamedTuple):
 EVERYTHING = Layer("facet.* facet_protocol.*", "*")
 SHELL = Layer(
     "facet facet.admission facet.config facet.mapping.* facet.outgoing facet.pipeline "
-    "facet.sequences facet.sinks facet.sources.naming facet.status facet_protocol.*"
+    "facet.plausibility facet.sequences facet.sinks facet.sources.naming facet.status "
+    "facet_protocol.*"
 )
 WIRING = Layer(  # the threads of the running service: they join sources and sinks by hand
     f"{SHELL.ours} facet.intake facet.session facet.sinks.* facet.sources.*"

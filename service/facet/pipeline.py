@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from facet.admission import Admission
 from facet.mapping.mapper import Mapper
 from facet.outgoing import Outgoing
+from facet.plausibility import Plausibility
 from facet.sinks import Message, Sink
 from facet.status import Account
 from facet_protocol.messages import Cut, Envelope, MapUpdate, Scan
@@ -45,12 +46,20 @@ class Pipeline:
         self._mapper, self._admission, self._account = mapper, admission, account
         self._sinks, self._outgoing = tuple(sinks), outgoing
         self._points_every_ns = points_every_ns  # 0: points are not sent
+        self._plausibility = Plausibility()
         self._applied: dict[str, Applied] = {}
         self._changed_tiles: set[Tile] = set()
         self._points_sent_ns = 0
         self.revision = 0
         self.log_time_ns = 0  # of the newest message applied
         self.is_stale = False  # something was inserted since the last update
+
+    def take_over(self, other: Pipeline) -> None:
+        """Go on where a pipeline of the same map and admission has ended."""
+        self._applied = other._applied
+        self._changed_tiles = other._changed_tiles
+        self.revision, self.log_time_ns = self._mapper.revision, other.log_time_ns
+        self.is_stale = other.is_stale
 
     def insert(self, envelope: Envelope) -> bool:
         """Put one scan into the map, without deriving anything; False when it is left out."""
@@ -60,6 +69,9 @@ class Pipeline:
             return False
         inserted = self._mapper.insert(scan)
         self._count(scan, inserted.points_stored, inserted.rejected)
+        for name, text in self._plausibility.oddities(scan, envelope.received_ns).items():
+            self._account.count(name, scan.source)
+            self._account.complain(scan.source, name, text)
         previous = self._applied.get(scan.source)
         num_scans = (previous.num_scans if previous else 0) + 1
         self._applied[scan.source] = Applied(envelope, scan, num_scans)
@@ -116,6 +128,8 @@ class Pipeline:
         self._emit(self._outgoing.points(self._mapper.points(tiles), self.log_time_ns))
 
     def _emit(self, messages: Iterable[tuple[Envelope, Message | None]]) -> None:
+        if not self._sinks:  # nothing is encoded for nobody
+            return
         for envelope, message in messages:
             for sink in self._sinks:
                 sink.write(envelope, message)

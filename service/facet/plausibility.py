@@ -1,0 +1,58 @@
+"""What is odd about a scan and yet no reason to leave it out: counted, and said once in a while."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from facet_protocol.messages import Pose, Scan
+
+FUTURE_NS = 2 * 10**9  # a stamp further ahead of its receipt comes from a wrong clock
+OLDEST_NS = 946_684_800 * 10**9  # 2000-01-01: an earlier stamp comes from no clock
+JUMP_NS = 10**8  # poses closer than this in time and
+JUMP_M = 5.0  # farther than this apart,
+JUMP_COS = math.cos(math.radians(90.0) / 2.0)  # or turned by more than 90 degrees: a jump
+
+
+@dataclass(frozen=True, slots=True)
+class _Last:
+    stamp_ns: int  # the newest
+    pose: Pose
+
+
+class Plausibility:
+    """Compares each scan with the source's one before. Decides nothing: the map does not depend on
+    it, for it knows the order in which scans came."""
+
+    def __init__(self) -> None:
+        self._last: dict[str, _Last] = {}
+
+    def oddities(self, scan: Scan, received_ns: int) -> dict[str, str]:
+        """What is odd, by the name it is counted under, and in words: `bad_stamp` (0, before the
+        year 2000, or ahead of its receipt), `out_of_order`, `pose_jump`."""
+        odd: dict[str, str] = {}
+        if scan.stamp_ns < OLDEST_NS:
+            odd["bad_stamp"] = f"stamp {scan.stamp_ns} ns is before the year 2000"
+        elif received_ns and scan.stamp_ns > received_ns + FUTURE_NS:
+            ahead_s = (scan.stamp_ns - received_ns) * 1e-9
+            odd["bad_stamp"] = f"stamp is {ahead_s:.1f} s ahead of its receipt"
+        last = self._last.get(scan.source)
+        newest_ns = scan.stamp_ns
+        if last is not None:
+            newest_ns = max(newest_ns, last.stamp_ns)
+            if scan.stamp_ns < last.stamp_ns:
+                behind_s = (last.stamp_ns - scan.stamp_ns) * 1e-9
+                odd["out_of_order"] = f"stamp is {behind_s:.3f} s behind the one before"
+            if abs(scan.stamp_ns - last.stamp_ns) <= JUMP_NS:
+                odd |= _jump(last.pose, scan.pose)
+        self._last[scan.source] = _Last(newest_ns, scan.pose)
+        return odd
+
+
+def _jump(one: Pose, two: Pose) -> dict[str, str]:
+    distance = math.dist(one.position.tolist(), two.position.tolist())
+    cosine = abs(float(one.orientation_xyzw @ two.orientation_xyzw))  # of half the angle
+    if distance > JUMP_M or cosine < JUMP_COS:
+        turn = math.degrees(2.0 * math.acos(min(1.0, cosine)))
+        return {"pose_jump": f"moved {distance:.2f} m and turned {turn:.0f} degrees at once"}
+    return {}

@@ -1,0 +1,127 @@
+"""What the fault tests share: the line from a message to the map, with its log and its account."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
+
+from facet.admission import Admission
+from facet.mapping.digest import state_digest
+from facet.mapping.mapper import Mapper
+from facet.mapping.settings import MapSettings
+from facet.outgoing import Outgoing
+from facet.pipeline import Pipeline
+from facet.sinks.recorder import Recorder
+from facet.sources.naming import is_scan, source_of
+from facet.sources.recording import Recording
+from facet.status import Account
+from facet_protocol.messages import Envelope, Scan
+from rig import room_scan, scan_envelope
+
+SETTINGS = MapSettings(voxel_m=0.1)
+SOURCE = "r1/lidar"
+
+
+class Line:
+    """Everything behind the door, in one thread: recorded first, then applied."""
+
+    def __init__(self, folder: Path) -> None:
+        self.account, self.mapper = Account(), Mapper(SETTINGS)
+        self._folder = folder
+        self._recorder = Recorder(folder, "map", {}, clock=lambda: 10**18)
+        self._pipeline = Pipeline(
+            self.mapper,
+            Admission(self.account, "map", SETTINGS.reach_m),
+            self.account,
+            [],
+            Outgoing("map", "map"),
+        )
+
+    def take(self, envelopes: Iterable[Envelope]) -> Line:
+        for envelope in envelopes:
+            self._recorder.write(envelope)
+            self.account.arrive(source_of(envelope.key))
+            self._pipeline.insert(envelope)
+            assert self.account.balance().is_exact
+        self._recorder.commit()
+        return self
+
+    def state(self) -> str:
+        return state_digest(self.mapper._store, self.mapper._free)
+
+    def recorded(self) -> list[bytes]:
+        return [bytes(e.payload) for e in Recording([self._folder])]
+
+    def num_points(self) -> int:
+        """Points that the voxels hold."""
+        store = self.mapper._store
+        return int(store.columns.moments[store.occupied_rows(), 0].sum())
+
+
+def small_scan(sequence: int, robot: str = "r1", num: int = 300) -> Scan:
+    scan = room_scan(sequence, robot)
+    return replace(scan, points=scan.points[:: len(scan.points) // num][:num])
+
+
+def envelopes(robot: str, *sequences: int) -> list[Envelope]:
+    return [scan_envelope(small_scan(k, robot)) for k in sequences]
+
+
+def around(bad: Iterable[Envelope]) -> list[Envelope]:
+    """Two robots at work, and `bad` in the middle."""
+    before = [*envelopes("r1", 1), *envelopes("r2", 1)]
+    return [*before, *bad, *envelopes("r1", 10), *envelopes("r2", 2)]
+
+
+def changed(change: object, sequence: int = 5) -> Envelope:
+    """A scan whose protobuf message `change` has spoiled."""
+    good = scan_envelope(small_scan(sequence))
+    message = PointCloud.FromString(bytes(good.payload))
+    change(message)  # type: ignore[operator]
+    return replace(good, payload=message.SerializeToString())
+
+
+def with_rows(rows: list[list[float]], sequence: int = 5) -> Scan:
+    """A scan with these points (sensor frame) besides its own."""
+    scan = small_scan(sequence)
+    extra = np.array(rows, np.float64).astype(np.float32)
+    return replace(scan, points=np.concatenate([scan.points[:200], extra, scan.points[200:]]))
+
+
+def lines(caplog: pytest.LogCaptureFixture, reason: str) -> list[str]:
+    """What was said in the log about this reason and source."""
+    wanted = f"{SOURCE}: {reason}: "
+    return [r.getMessage() for r in caplog.records if r.getMessage().startswith(wanted)]
+
+
+def left_out(
+    folder: Path,
+    caplog: pytest.LogCaptureFixture,
+    bad: list[Envelope],
+    reason: str,
+) -> Line:
+    """Promise C: counted once each, said once, recorded all the same, no trace in the map, and the
+    other source goes on."""
+    clean = Line(folder / "clean").take(around([]))
+    with caplog.at_level(logging.INFO):
+        spoiled = Line(folder / "spoiled").take(around(bad))
+    account = spoiled.account
+    assert account[f"rejected.{reason}[{SOURCE}]"] == account[f"rejected.{reason}"] == len(bad)
+    assert account.balance().rejected == len(bad)
+    assert len(lines(caplog, reason)) == 1, caplog.messages
+    assert spoiled.state() == clean.state()
+    assert [bytes(e.payload) for e in around(bad)] == spoiled.recorded()
+    for name in ("r1/lidar", "r2/lidar"):
+        assert account[f"applied[{name}]"] == clean.account[f"applied[{name}]"] == 2
+    assert account.balance().in_flight == 0
+    return spoiled
+
+
+def scans_in(folder: Path) -> list[Envelope]:
+    return [e for e in Recording([folder]) if is_scan(e)]
