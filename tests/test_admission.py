@@ -74,5 +74,5 @@ def test_a_bad_message_does_not_use_up_its_sequence() -> None:
 
 def test_a_topic_from_elsewhere_gets_a_name() -> None:
     assert robot_and_sensor("facet/v1/map/robot/r1/scan/front") == ("r1", "front")
-    assert robot_and_sensor("/velodyne/points 2") == ("recording", "velodyne_points_2")
-    assert robot_and_sensor("../..") == ("recording", "scan")
+    assert robot_and_sensor("/velodyne/points 2") == ("robot", "velodyne_points_2")
+    assert robot_and_sensor("../..") == ("robot", "scan")

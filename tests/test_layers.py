@@ -30,9 +30,9 @@ class Layer(NamedTuple):
 
 EVERYTHING = Layer("facet.* facet_protocol.*", "*")
 SHELL = Layer(
-    "facet facet.admission facet.config facet.mapping.* facet.outgoing facet.pipeline "
-    "facet.plausibility facet.sequences facet.sinks facet.sources.naming facet.status "
-    "facet_protocol.*"
+    "facet facet.admission facet.config facet.frames facet.mapping.* facet.outgoing facet.pipeline "
+    "facet.plausibility facet.resolution facet.sequences facet.sinks facet.sources.naming "
+    "facet.status facet_protocol.*"
 )
 WIRING = Layer(  # the threads of the running service: they join sources and sinks by hand
     f"{SHELL.ours} facet.intake facet.session facet.sinks.* facet.sources.*"
@@ -57,10 +57,16 @@ LAYERS = {  # the longest name that fits counts
     ),
     "facet.simulate": Layer("facet.simulate.* facet_protocol.*", "numpy numba"),
     "facet.config": Layer("", "pydantic"),
+    "facet.frames": Layer("facet_protocol.*", pure=True),
+    "facet.resolution": Layer("facet.frames facet_protocol.*", pure=True),
     "facet.session": Layer("facet.config", "zenoh"),
     "facet": SHELL,
     "facet.intake": WIRING,
-    "facet.service": Layer(f"{WIRING.ours} facet.export.*", "numpy zenoh"),
+    "facet.resume": Layer(f"{WIRING.ours} facet.checkpoint facet.cuts"),
+    "facet.keeper": Layer("facet.checkpoint facet.config facet.resume facet.status"),
+    "facet.service": Layer(
+        f"{WIRING.ours} facet.checkpoint facet.export.* facet.keeper facet.resume", "numpy zenoh"
+    ),
     "facet.commands": EVERYTHING,
     "facet.__main__": EVERYTHING,
 }

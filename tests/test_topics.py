@@ -53,3 +53,19 @@ def test_other_keys_are_refused(key: str) -> None:
 def test_a_command_that_does_not_exist_is_refused() -> None:
     with pytest.raises(ProtocolError, match="not one of pause"):
         topics.cmd_key("m", "fly")
+
+
+def test_keys_of_poses() -> None:
+    key = topics.pose_key("m", "r1", "base_link")
+    assert key == "facet/v1/m/robot/r1/pose/base_link"
+    assert topics.parse_pose_key(key) == ("r1", "base_link")
+    static = topics.transforms_key("m", "r1", static=True)
+    assert topics.parse_pose_key(static) == ("r1", "tf_static")
+    assert topics.parse_pose_key(topics.transforms_key("m", "r1")) == ("r1", "tf")
+    assert not topics.is_pose_key("facet/v1/m/robot/r1/pose")
+    with pytest.raises(ProtocolError):
+        topics.parse_pose_key("facet/v1/m/robot/r 1/tf")
+    with pytest.raises(ProtocolError):
+        topics.parse_pose_key("facet/v1/m/robot/r1/scan/front")
+    assert topics.poses_keys("m") == ("facet/v1/m/robot/*/pose/*", "facet/v1/m/robot/*/tf")
+    assert topics.poses_keys("m", static=True) == ("facet/v1/m/robot/*/tf_static",)

@@ -42,6 +42,7 @@ class Envelope:
     sequence: int = 0  # from 1; 0 means none
     received_ns: int = 0  # our clock, at the door
     rule: Rule | None = None  # what the settings say about its key
+    is_derived: bool = False  # Facet itself wrote it: no input
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -24,6 +24,7 @@ COMMANDS = ("pause", "resume", "checkpoint", "export", "erase", "record")
 
 _ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _SCAN_KEY = re.compile(rf"{PREFIX}/([^/]+)/robot/([^/]+)/scan/([^/]+)")
+_POSE_KEY = re.compile(rf"{PREFIX}/([^/]+)/robot/([^/]+)/(?:pose/([^/]+)|(tf|tf_static))")
 _CORRECTION_KEY = re.compile(rf"{PREFIX}/([^/]+)/robot/([^/]+)/correction")
 
 
@@ -61,6 +62,36 @@ def parse_scan_key(key: str) -> ScanKey:
 def scans_key(map_id: str) -> str:
     """Key expression of every scan of a map."""
     return _key(map_id, "robot/*/scan/*")
+
+
+def pose_key(map_id: str, robot: str, frame: str) -> str:
+    """Where a robot says where one of its frames is: poses apart from their scans."""
+    return _key(map_id, f"robot/{check_id(robot)}/pose/{check_id(frame)}")
+
+
+def transforms_key(map_id: str, robot: str, *, static: bool = False) -> str:
+    """Where a robot's transforms go; the static ones hold for ever."""
+    return _key(map_id, f"robot/{check_id(robot)}/{'tf_static' if static else 'tf'}")
+
+
+def is_pose_key(key: str) -> bool:
+    return _POSE_KEY.fullmatch(key) is not None
+
+
+def parse_pose_key(key: str) -> tuple[str, str]:
+    """(robot, frame), or (robot, "tf") of transforms. Raises ProtocolError when it is neither."""
+    match = _POSE_KEY.fullmatch(key)
+    if match is None:
+        raise ProtocolError(f"{key[:200]!r} is not the key of a pose", "bad_key")
+    map_id, robot, frame, transforms = match.groups()
+    check_id(map_id)
+    return check_id(robot), check_id(frame or transforms)
+
+
+def poses_keys(map_id: str, *, static: bool = False) -> tuple[str, ...]:
+    """Key expressions of all that says where robots' frames are; the static ones apart."""
+    tails = ("tf_static",) if static else ("pose/*", "tf")
+    return tuple(_key(map_id, f"robot/*/{tail}") for tail in tails)
 
 
 def correction_key(map_id: str, robot: str) -> str:

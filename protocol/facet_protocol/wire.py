@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -129,13 +129,19 @@ def check_pose(position: Iterable[float], orientation_xyzw: Iterable[float]) -> 
         raise ProtocolError(f"pose of {p.size} + {len(q)} numbers, expected 3 + 4", "bad_pose")
     if not all(map(math.isfinite, [*p.tolist(), *q])):
         raise ProtocolError(f"pose {p.tolist()} {q} is not finite", "bad_pose")
-    square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
-    norm = math.sqrt(square)
+    norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     if not abs(norm - 1.0) <= NORM_TOLERANCE:
         raise ProtocolError(f"quaternion {q} has norm {norm:.6g}", "bad_quaternion")
+    return Pose(p, np.array(normalised(q))), abs(norm - 1.0) > 1e-9
+
+
+def normalised(q: Sequence[float]) -> list[float]:
+    """The quaternion over its norm; one that is a unit within rounding keeps its bits."""
+    square = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3]
     if abs(square - 1.0) <= _EXACT_NORM:
-        return Pose(p, np.array(q)), False
-    return Pose(p, np.array([c / norm for c in q])), abs(norm - 1.0) > 1e-9
+        return list(q)
+    norm = math.sqrt(square)
+    return [c / norm for c in q]
 
 
 def stamp_of(timestamp: Timestamp) -> int:

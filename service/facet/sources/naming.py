@@ -1,31 +1,80 @@
-"""Who sent a message: robot and sensor, read from its key."""
+"""Who sent a message, and whether it is an input: read from its key, its schema and the rules."""
 
 from __future__ import annotations
 
 import re
 
+from facet_protocol import topics
 from facet_protocol.messages import Envelope, ProtocolError
+from facet_protocol.ros_definitions import ROS_POSES, ROS_TRANSFORMS
 from facet_protocol.scans import SCAN_SCHEMAS
-from facet_protocol.topics import parse_scan_key
 
-FOREIGN_ROBOT = "recording"  # who drove, where the topic does not say
+FOREIGN_ROBOT = "robot"  # who drove, where the topic does not say
+TRANSFORM_SCHEMAS = (*ROS_TRANSFORMS, "foxglove.FrameTransform", "foxglove.FrameTransforms")
+POSE_SCHEMAS = (*ROS_POSES, "foxglove.PoseInFrame")  # of what, only a rule or the key says
+
+_DOMAIN = re.compile(r"/(\d+)/")
 
 
 def robot_and_sensor(key: str) -> tuple[str, str]:
-    """(robot, sensor) of a scan's key; of a topic from elsewhere, a name made of the topic."""
+    """(robot, sensor) of an input's key; of a topic from elsewhere, names made of the topic."""
     try:
-        names = parse_scan_key(key)
+        if topics.is_pose_key(key):
+            return topics.parse_pose_key(key)
+        names = topics.parse_scan_key(key)
     except ProtocolError:
         sensor = re.sub(r"[^A-Za-z0-9_-]+", "_", key).strip("_")[:64] or "scan"
-        return FOREIGN_ROBOT, sensor
+        domain = _DOMAIN.match(key)  # of ROS: a topic's name never starts with a digit
+        return f"domain-{domain.group(1)}"[:64] if domain else FOREIGN_ROBOT, sensor
     return names.robot, names.sensor
 
 
-def source_of(key: str) -> str:
+def names_of(envelope: Envelope) -> tuple[str, str]:
+    """(robot, sensor) of an input, as a rule names them, else its key."""
+    robot, sensor = robot_and_sensor(envelope.key)
+    rule = envelope.rule
+    if rule is None:
+        return robot, sensor
+    return rule.robot or robot, rule.sensor or sensor
+
+
+def source_of(origin: Envelope | str) -> str:
     """The same as one word, `robot/sensor`: the name a source is counted under."""
-    return "/".join(robot_and_sensor(key))
+    names = robot_and_sensor(origin) if isinstance(origin, str) else names_of(origin)
+    return "/".join(names)
 
 
 def is_scan(envelope: Envelope) -> bool:
-    """Whether it is an input: our own points (`/facet/points`) are clouds too, but no scans."""
-    return envelope.schema in SCAN_SCHEMAS and not envelope.key.startswith("/facet/")
+    """Whether it is a scan: our own points (`/facet/points`) are clouds too, but no scans."""
+    return envelope.schema in SCAN_SCHEMAS and not _is_own(envelope)
+
+
+def is_input(envelope: Envelope) -> bool:
+    """Whether the map is made of it: a scan, or what says where its sensor is."""
+    if is_scan(envelope):
+        return True
+    if _is_own(envelope):
+        return False
+    if envelope.schema in TRANSFORM_SCHEMAS:
+        return True
+    return envelope.schema in POSE_SCHEMAS and bool(pose_frame(envelope))
+
+
+def pose_frame(envelope: Envelope) -> str:
+    """The frame that a pose is the pose of; "" when neither a rule nor the key says it: a pose may
+    be a goal as well, and is not guessed to be the robot's."""
+    if envelope.rule is not None and envelope.rule.frame:
+        return envelope.rule.frame
+    if topics.is_pose_key(envelope.key):
+        return topics.parse_pose_key(envelope.key)[1]
+    return ""
+
+
+def is_static(envelope: Envelope) -> bool:
+    """Whether its transforms hold for ever: what ROS sends on tf_static."""
+    return envelope.key.rpartition("/")[2] == "tf_static"
+
+
+def _is_own(envelope: Envelope) -> bool:
+    """What Facet itself derived, in its own log."""
+    return envelope.is_derived or envelope.key.startswith("/facet/")
