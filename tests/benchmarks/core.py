@@ -18,7 +18,7 @@ from typing import Any
 
 from benchmarks import growth, rates
 from benchmarks.charts import ratios
-from benchmarks.figures import Figure, report
+from benchmarks.figures import Figure, name_of, report
 from facet.mapping.settings import MapSettings
 from facet.warmup import warm_up
 
@@ -67,8 +67,8 @@ def main(arguments: list[str]) -> None:
         own, found = run(name, quick)
         figures += own
         details |= found
-    report("core", "The core at sensor rate", figures, details)
-    ratios("core", "the core, each figure over its target", figures)
+    report(name_of("core", quick), "The core at sensor rate", figures, details)
+    ratios(name_of("core", quick), "the core, each figure over its target", figures)
 
 
 if __name__ == "__main__":

@@ -67,6 +67,11 @@ def write(name: str, content: dict[str, Any]) -> Path:
     return path
 
 
+def name_of(bench: str, quick: bool) -> str:
+    """A smoke run does not overwrite what a full run found."""
+    return f"{bench}-quick" if quick else bench
+
+
 def skip(reason: str) -> None:
     """End the benchmark without a verdict."""
     out.print(f"skipped: {reason}")

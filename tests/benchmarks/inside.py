@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from facet.mapping.freespace import FreeSpace
 from facet.mapping.mapper import Mapper
 from facet.mapping.settings import TICKS
+from facet.mapping.store import VoxelStore
 from facet_protocol.messages import Scan
 
 
@@ -55,6 +56,20 @@ def centroids(mapper: Mapper) -> tuple[NDArray[np.float64], NDArray[np.float64]]
 def free_space(mapper: Mapper) -> FreeSpace:
     """What tells an opening from what was not observed."""
     return mapper._free
+
+
+def parts(mapper: Mapper) -> tuple[VoxelStore, FreeSpace]:
+    """Its store and its free space, to be timed apart."""
+    return mapper._store, mapper._free
+
+
+def num_blocks(mapper: Mapper) -> int:
+    return int(mapper._store.num_blocks)
+
+
+def cells_passed(mapper: Mapper) -> int:
+    """How many times a beam passed a cell."""
+    return int(mapper._free.cells()[1].sum(dtype=np.int64))
 
 
 def free_bytes(mapper: Mapper) -> int:

@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
 MOST_NORMALS_DEG = 25.0  # a point's normal against its shape's: CGAL's own default
+REACH = 3.0  # voxels between points of one cluster of a RANSAC plane
 MIN_AREA_M2 = 0.25  # of the smallest shape, as in Facet
-OPEN3D_NEIGHBOURS = 30
+OPEN3D_NEIGHBOURS = 30  # its own default
+MIN_EDGE_M = 0.2  # of a patch; its default is a share of the map
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,14 +69,16 @@ def open3d_tensor_normals(cloud: Any, radius_m: float, max_neighbours: int) -> N
     cloud.estimate_normals(max_nn=max_neighbours, radius=radius_m)
 
 
-def open3d_patches(cloud: Any, min_points: int) -> list[Any]:
-    """Oriented boxes of planar patches (Araujo & Oliveira 2020), its own defaults."""
+def open3d_patches(
+    cloud: Any, min_points: int, variance_deg: float = 60.0, coplanarity_deg: float = 75.0
+) -> list[Any]:
+    """Oriented boxes of planar patches (Araujo & Oliveira 2020); angles: its own defaults."""
     return list(
         cloud.detect_planar_patches(
-            normal_variance_threshold_deg=60,
-            coplanarity_deg=75,
+            normal_variance_threshold_deg=variance_deg,
+            coplanarity_deg=coplanarity_deg,
             outlier_ratio=0.75,
-            min_plane_edge_length=0.0,
+            min_plane_edge_length=MIN_EDGE_M,
             min_num_points=min_points,
             search_param=open3d.geometry.KDTreeSearchParamKNN(OPEN3D_NEIGHBOURS),
         )
@@ -122,24 +126,28 @@ def cgal_points(cloud: Cloud) -> tuple[Any, Any]:
     return points, points.add_int_map("shape")
 
 
-def cgal_growing(points: Any, shapes: Any, cloud: Cloud) -> int:
-    """Region growing on neighbours (Lafarge & Mallet 2012). Returns the number of shapes."""
+def cgal_growing(
+    points: Any, shapes: Any, cloud: Cloud, distance: float = 1.0, neighbours: int = 12
+) -> int:
+    """Region growing on nearest neighbours (Lafarge & Mallet 2012), `distance` voxels from the
+    plane at most; 12: the default of CGAL's own examples. Returns the number of shapes."""
     from CGAL.CGAL_Shape_detection import region_growing
 
     return int(
         region_growing(
-            points, shapes, cloud.min_points, cloud.voxel_m, 3.0 * cloud.voxel_m,
-            np.cos(np.radians(MOST_NORMALS_DEG)), 12,
+            points, shapes, cloud.min_points, distance * cloud.voxel_m, -1.0,
+            np.cos(np.radians(MOST_NORMALS_DEG)), neighbours,
         )
     )  # fmt: skip
 
 
-def cgal_ransac(points: Any, shapes: Any, cloud: Cloud) -> int:
-    """Efficient RANSAC (Schnabel et al. 2007), planes only. Returns the number of shapes."""
+def cgal_ransac(points: Any, shapes: Any, cloud: Cloud, distance: float = 0.6) -> int:
+    """Efficient RANSAC (Schnabel et al. 2007), planes only, `distance` voxels from the plane at
+    most: two standard deviations of our drives. Returns the number of shapes."""
     from CGAL.CGAL_Shape_detection import efficient_RANSAC
 
     found = efficient_RANSAC(
-        points, shapes, cloud.min_points, cloud.voxel_m, 3.0 * cloud.voxel_m,
+        points, shapes, cloud.min_points, distance * cloud.voxel_m, REACH * cloud.voxel_m,
         np.cos(np.radians(MOST_NORMALS_DEG)), 0.01, True, False, False, False, False,
     )  # fmt: skip
     return len(found)

@@ -142,7 +142,9 @@ def judge(case: Case, mapped: Mapped, scored: Score) -> list[Figure]:
 
 
 def main(arguments: list[str]) -> None:
-    """`paper.py [SCENE] [VOXEL_M]`: one scene, another voxel."""
+    """`paper.py [--quick | SCENE [VOXEL_M]]`: one scene, another voxel."""
+    if "--quick" in arguments:
+        arguments = ["corridor"]
     chosen = [c for c in CASES if not arguments or c.scene == arguments[0]]
     if len(arguments) > 1:
         chosen = [replace(c, voxel_m=float(arguments[1])) for c in chosen]

@@ -23,7 +23,7 @@ from scipy.spatial import cKDTree
 from benchmarks import buildings, inside, libraries
 from benchmarks.accuracy import cloud_of, compare
 from benchmarks.charts import ratios
-from benchmarks.figures import Figure, at_least, at_most, report
+from benchmarks.figures import Figure, at_least, at_most, name_of, report
 from benchmarks.growth import all_copies, grow
 from benchmarks.libraries import Cloud
 from facet.commands.terminal import table
@@ -190,8 +190,8 @@ def main(arguments: list[str]) -> None:
         own, found = sections[name](quick)
         figures += own
         details |= found
-    report("peers", "Beside the libraries", figures, details)
-    ratios("peers", "beside the libraries, each figure over its target", figures)
+    report(name_of("peers", quick), "Beside the libraries", figures, details)
+    ratios(name_of("peers", quick), "beside the libraries, each figure over its target", figures)
 
 
 if __name__ == "__main__":

@@ -184,7 +184,9 @@ def changed(settings: MapSettings) -> str:
 
 
 def main(arguments: list[str]) -> None:
-    """`real.py [PLACE]`."""
+    """`real.py [--quick | PLACE]`."""
+    if "--quick" in arguments:
+        arguments = [PLACES[0].name]
     if not SHARED_DATA.exists():
         skip(f"no recordings at {SHARED_DATA}")
     for name in ("default", "suited"):

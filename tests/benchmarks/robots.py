@@ -23,7 +23,7 @@ import psutil
 from benchmarks import buildings
 from benchmarks.buildings import LIDAR_130K, LINE_361, PERIOD_NS, Looks
 from benchmarks.charts import ratios
-from benchmarks.figures import Figure, at_least, report
+from benchmarks.figures import Figure, at_least, name_of, report
 from benchmarks.live import SETTLE_S, judge, play, read_log, service, stage_table
 from facet.commands.play import RobotPublisher, play_scans
 from facet.commands.simulate import envelope_of
@@ -231,8 +231,8 @@ def main(arguments: list[str]) -> None:
         own, found = sections[name](quick)
         figures += own
         details |= found
-    report("robots", "Robots in real time", figures, details)
-    ratios("robots", "robots in real time, each figure over its target", figures)
+    report(name_of("robots", quick), "Robots in real time", figures, details)
+    ratios(name_of("robots", quick), "robots in real time, each figure over its target", figures)
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from typing import Any
 
@@ -71,16 +72,19 @@ def growing(scans: list[Scan]) -> tuple[list[Figure], list[dict[str, Any]]]:
     return figures, costs
 
 
-def main() -> None:
+def main(arguments: list[str]) -> None:
+    """`speed.py [--quick]`."""
+    quick = "--quick" in arguments
     warm_up(MapSettings())
     noise = Noise(0.012, 0.008)
-    scans = list(Simulation("office", "lidar3d", noise=noise, num_scans=NUM_SCANS).scans())
+    num_scans, growing_s = (30, 3.0) if quick else (NUM_SCANS, GROWING_S)
+    scans = list(Simulation("office", "lidar3d", noise=noise, num_scans=num_scans).scans())
     figures, derived = whole(scans)
     del scans
-    drive = Simulation("office", "lidar3d", noise=noise, duration_s=GROWING_S)
+    drive = Simulation("office", "lidar3d", noise=noise, duration_s=growing_s)
     grown, costs = growing(list(drive.scans()))
     report("speed", "Speed of the core", figures + grown, {"whole": derived, "growing": costs})
 
 
 if __name__ == "__main__":
-    main()
+    main(sys.argv[1:])
