@@ -63,7 +63,10 @@ def lidar(quick: bool) -> tuple[list[Figure], dict[str, Any]]:
     finally:
         shutil.rmtree(folder)
     figures = judge(journal, laps * len(near), LIDAR_LIMIT_MS)
-    stages = stage_table(journal, list(journal.laps.values())[-1])
+    first, *_, last = journal.laps.values()
+    stages = stage_table(journal, last)
+    behind_s = (max(at for _, at in first.cuts) - max(first.received.values())) * 1e-9
+    figures.append(Figure("exploring: caught up after the last scan, s", behind_s))
     named = [Figure(f"130 k x 10 Hz: {f.what}", f.value, f.target, f.met) for f in figures]
     return named, {"lidar": {"stages_ms": stages, "laps": laps}}
 
