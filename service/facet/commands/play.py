@@ -59,7 +59,8 @@ class RobotPublisher:
             congestion_control=zenoh.CongestionControl.BLOCK,
             cache=zenoh.ext.CacheConfig(max_samples=num_kept),
             sample_miss_detection=zenoh.ext.MissDetectionConfig(
-                heartbeat=None, sporadic_heartbeat=HEARTBEAT_S
+                heartbeat=HEARTBEAT_S,
+                sporadic_heartbeat=None,  # also when it sends no more
             ),
             publisher_detection=True,
         )
