@@ -85,10 +85,17 @@ class Scan:
     no_return: NDArray[np.float32]  # (M, 3) m, sensor frame; where the range of an empty beam ends
     ignored: dict[str, int] = field(default_factory=dict)  # beams left out at decode, by reason
     renormalised: bool = False  # the quaternion as received was off by 1e-9 to 1e-3
+    has_pose: bool = True  # False: `pose` is the identity, for none was sent
 
     @property
     def source(self) -> str:
         return f"{self.robot}/{self.sensor}"
+
+    @property
+    def is_placed(self) -> bool:
+        """Its pose was sent with it, and says more than that the points are in their own frame."""
+        p, q = self.pose.position.tolist(), self.pose.orientation_xyzw.tolist()
+        return self.has_pose and (any(p) or any(q[:3]))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

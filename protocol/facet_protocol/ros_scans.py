@@ -64,6 +64,7 @@ def decode_ros_scan(envelope: Envelope, robot: str, sensor: str, reach_m: float)
         points=points,
         no_return=no_return,
         ignored=ignored,
+        has_pose=False,
     )
 
 

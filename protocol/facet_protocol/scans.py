@@ -29,6 +29,7 @@ class _Head(NamedTuple):
     frame_id: str
     pose: Pose
     renormalised: bool
+    has_pose: bool = True
 
 
 def _head(
@@ -44,7 +45,7 @@ def _head(
         return _Head(stamp_ns, message.frame_id, *pose_of(message.pose))
     if pose_required:
         raise ProtocolError(f"{envelope.schema}: no pose", "bad_pose")
-    return _Head(stamp_ns, message.frame_id, _IDENTITY, False)
+    return _Head(stamp_ns, message.frame_id, _IDENTITY, False, has_pose=False)
 
 
 def decode_scan(
@@ -67,8 +68,8 @@ def decode_scan(
     if kind == (CLOUD_SCHEMA, "protobuf"):
         return _decode_cloud(envelope, robot, sensor, frame_id, pose_required)
     if kind == (FAN_SCHEMA, "protobuf"):
-        fan, renormalised = _decode_fan(envelope, robot, sensor, frame_id, pose_required)
-        return project(fan, reach_m, renormalised)
+        fan, head = _decode_fan(envelope, robot, sensor, frame_id, pose_required)
+        return project(fan, reach_m, head.renormalised, head.has_pose)
     if envelope.schema in ROS_SCANS and envelope.encoding == "cdr":
         if pose_required:
             raise ProtocolError(f"{envelope.schema}: no pose", "bad_pose")
@@ -96,12 +97,13 @@ def _decode_cloud(
         points=points,
         no_return=no_return,
         renormalised=head.renormalised,
+        has_pose=head.has_pose,
     )
 
 
 def _decode_fan(
     envelope: Envelope, robot: str, sensor: str, frame_id: str | None, pose_required: bool
-) -> tuple[LineFan, bool]:
+) -> tuple[LineFan, _Head]:
     message = parse(LaserScan, envelope.payload)
     head = _head(message, envelope, frame_id, pose_required)
     start, end = message.start_angle, message.end_angle
@@ -119,10 +121,12 @@ def _decode_fan(
         end_angle=end,
         ranges=np.fromiter(message.ranges, np.float64, len(message.ranges)),
     )
-    return fan, head.renormalised
+    return fan, head
 
 
-def project(fan: LineFan, reach_m: float = REACH_M, renormalised: bool = False) -> Scan:
+def project(
+    fan: LineFan, reach_m: float = REACH_M, renormalised: bool = False, has_pose: bool = True
+) -> Scan:
     """The fan as points in the sensor's x-y plane."""
     points, no_return = project_fan(fan.start_angle, fan.end_angle, fan.ranges, reach_m)
     return Scan(
@@ -138,6 +142,7 @@ def project(fan: LineFan, reach_m: float = REACH_M, renormalised: bool = False) 
         no_return=no_return,
         ignored=count_ignored(fan.ranges),
         renormalised=renormalised,
+        has_pose=has_pose,
     )
 
 

@@ -1,54 +1,234 @@
-"""Which messages of the log are applied: decoded, in the map's frame, each once. No clock."""
+"""Which messages of the log are applied: decoded, placed in the map, each once. No clock."""
 
 from __future__ import annotations
 
 import hashlib
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import NamedTuple, TypeGuard
 
+import numpy as np
+from numpy.typing import NDArray
+
+from facet.frames import Rank
+from facet.resolution import Resolution, Settled
 from facet.sequences import SequenceLedger
-from facet.sources.naming import robot_and_sensor, source_of
+from facet.sources.naming import (
+    POSE_SCHEMAS,
+    TRANSFORM_SCHEMAS,
+    is_static,
+    names_of,
+    pose_frame,
+    source_of,
+)
 from facet.status import Account
-from facet_protocol.messages import Envelope, ProtocolError, Scan
+from facet_protocol.codec import decode
+from facet_protocol.messages import (
+    Envelope,
+    ProtocolError,
+    ResolvedPose,
+    Scan,
+    StampedPose,
+    StampedTransform,
+    Transforms,
+)
+from facet_protocol.ros_definitions import ODOMETRY
 from facet_protocol.scans import decode_scan
-from facet_protocol.topics import PREFIX, parse_scan_key
+from facet_protocol.topics import PREFIX, RESOLVED_TOPIC, parse_pose_key, parse_scan_key
+from facet_protocol.wire import unwrap
+
+HASH_BYTES = 16
+WAIT_NS = 500_000_000  # of stamps: for a scan's pose, and between two poses
+WAIT_BYTES = 256 << 20  # of scans that wait
+
+
+class Admitted(NamedTuple):
+    """A scan to insert; `resolved` when it came apart from its pose."""
+
+    envelope: Envelope
+    scan: Scan
+    resolved: ResolvedPose | None = None
 
 
 class Admission:
-    """Turns envelopes into scans, in log order, and counts what it leaves out under its reason."""
+    """Turns envelopes into scans, in log order, and counts what it leaves out under its reason.
 
-    def __init__(self, account: Account, frame_id: str, reach_m: float) -> None:
+    `logged`: the log says with which poses scans were applied. What does not have its pose with it
+    waits for it in `Resolution`.
+    """
+
+    def __init__(
+        self,
+        account: Account,
+        frame_id: str,
+        reach_m: float,
+        *,
+        wait_ns: int = WAIT_NS,
+        wait_bytes: int = WAIT_BYTES,
+        logged: bool = False,
+    ) -> None:
         self._account = account
         self._frame_id, self._reach_m = frame_id, reach_m
+        self._resolution = Resolution(frame_id, wait_ns, wait_bytes, logged=logged)
         self._applied = SequenceLedger()
         self._unnumbered: set[bytes] = set()  # of scans without a sequence: hashes
 
-    def admit(self, envelope: Envelope) -> Scan | None:
-        """The scan to insert; None when it is a duplicate or not a good scan."""
-        source = source_of(envelope.key)
+    def report_to(self, account: Account) -> None:
+        """Count there from now on, also what waits."""
+        self._account = account
+        for envelope in self._resolution.waiting():
+            account.arrive(source_of(envelope))
+
+    def freeze(self) -> dict[str, NDArray[np.uint8]]:
+        """What it remembers, for a checkpoint."""
+        ledger = json.dumps(self._applied.freeze(), sort_keys=True).encode()
+        hashes = b"".join(sorted(self._unnumbered))
+        return {
+            "ledger": np.frombuffer(ledger, np.uint8),
+            "unnumbered": np.frombuffer(hashes, np.uint8).reshape(-1, HASH_BYTES),
+        }
+
+    def thaw(self, frozen: Mapping[str, NDArray[np.uint8]]) -> None:
+        """Remember what was frozen. Raises KeyError, TypeError, ValueError for anything else."""
+        self._applied = SequenceLedger.thaw(json.loads(frozen["ledger"].tobytes()))
+        hashes = frozen["unnumbered"].reshape(-1, HASH_BYTES)
+        self._unnumbered = {row.tobytes() for row in hashes}
+
+    def admit(self, envelope: Envelope) -> list[Admitted]:
+        """The scans to insert: this one, or such as have waited for this pose. Often none."""
+        if envelope.key == RESOLVED_TOPIC:
+            return self._confirm(envelope)
+        source = source_of(envelope)
         try:
-            scan = self._decode(envelope)
+            rule = envelope.rule
+            if rule is not None and rule.envelope_field:
+                payload = unwrap(envelope.payload, rule.envelope_field)
+                inner = replace(envelope, payload=payload)
+            else:
+                inner = envelope
+            if envelope.schema in TRANSFORM_SCHEMAS or envelope.schema in POSE_SCHEMAS:
+                return self._admit_pose(envelope, inner, source)
+            return self._admit_scan(envelope, inner, source)
         except ProtocolError as error:
-            self._account.settle(source, f"rejected.{error.reason}")
-            self._account.complain(source, error.reason, str(error))
-            return None
+            self._refuse(source, error)
+            return []
+
+    def finish(self) -> list[Admitted]:
+        """No message will come any more: what waits is placed now, or refused."""
+        return self._take(self._resolution.finish())
+
+    def go_live(self) -> list[Admitted]:
+        """The log ends here: what it does not say is found from the poses that come."""
+        return self._take(self._resolution.go_live())
+
+    def _admit_scan(self, envelope: Envelope, inner: Envelope, source: str) -> list[Admitted]:
+        scan = self._decode(inner)
         if not self._is_first(envelope, scan.source):
             self._account.settle(source, "duplicate")
-            return None
+            return []
         if scan.renormalised:
             self._account.count("renormalised", source)
-        return scan
+        if scan.frame_id == self._frame_id:
+            return [Admitted(envelope, scan)]
+        return self._take(self._resolution.hold(envelope, scan))
 
     def _decode(self, envelope: Envelope) -> Scan:
+        """The scan, with what is to be known of its frame. Raises ProtocolError."""
         if envelope.key.startswith(f"{PREFIX}/"):
             parse_scan_key(envelope.key)  # a name of ours that is none is refused, not mended
-        robot, sensor = robot_and_sensor(envelope.key)
-        return decode_scan(envelope, robot, sensor, self._reach_m, frame_id=self._frame_id)
+        robot, sensor = names_of(envelope)
+        scan = decode_scan(envelope, robot, sensor, self._reach_m, pose_required=False)
+        if envelope.rule is not None and envelope.rule.frame:
+            scan = replace(scan, frame_id=envelope.rule.frame)
+        if scan.frame_id == self._frame_id:
+            if not scan.has_pose:
+                raise ProtocolError(f"{envelope.schema}: no pose", "bad_pose")
+        elif not scan.frame_id or (
+            scan.is_placed and not self._resolution.knows(robot, scan.frame_id)
+        ):
+            text = f"frame_id is {scan.frame_id[:80]!r}, expected {self._frame_id!r}"
+            raise ProtocolError(f"{envelope.schema}: {text}", "wrong_frame")
+        return scan
+
+    def _admit_pose(self, envelope: Envelope, inner: Envelope, source: str) -> list[Admitted]:
+        if envelope.key.startswith(f"{PREFIX}/"):
+            parse_pose_key(envelope.key)
+        message = decode(inner)
+        robot, _ = names_of(envelope)
+        transforms, refused = self._transforms(envelope, message)
+        placed: list[Settled] = []
+        for transform in transforms:
+            reason, settled = self._resolution.tell(robot, transform, _rank(envelope), envelope.key)
+            placed += settled
+            refused += (reason,) if reason else ()
+        self._account.settle(source, "used_as_pose")
+        for reason in refused:
+            self._account.count(f"poses_rejected.{reason}", source)
+        return self._take(placed)
+
+    def _transforms(
+        self, envelope: Envelope, message: object
+    ) -> tuple[tuple[StampedTransform, ...], tuple[str, ...]]:
+        """What a message says of frames, and the reasons for what it says in vain."""
+        child = pose_frame(envelope)
+        if isinstance(message, Transforms):
+            return message.transforms, message.refused
+        if isinstance(message, StampedTransform):
+            return (replace(message, child_frame_id=child) if child else message,), ()
+        if not isinstance(message, StampedPose) or not child or child == message.frame_id:
+            text = f"a pose in {getattr(message, 'frame_id', '')[:80]!r}, but of which frame?"
+            raise ProtocolError(f"{envelope.schema}: {text} A rule can say it", "wrong_frame")
+        return (StampedTransform(message.stamp_ns, message.frame_id, child, message.pose),), ()
+
+    def _confirm(self, envelope: Envelope) -> list[Admitted]:
+        """The log says with which pose a scan was applied."""
+        try:
+            message = decode(envelope)
+        except ProtocolError as error:
+            self._account.complain(RESOLVED_TOPIC, error.reason, str(error))
+            return []
+        return self._take(self._resolution.confirm(message)) if _is_resolved(message) else []
+
+    def _take(self, settled: Iterable[Settled]) -> list[Admitted]:
+        """What was placed, with the record of it; what was refused is counted."""
+        admitted = []
+        for envelope, scan, error in settled:
+            if error is not None:
+                self._refuse(source_of(envelope), error)
+                continue
+            resolved = ResolvedPose(
+                robot=scan.robot,
+                sensor=scan.sensor,
+                epoch=envelope.epoch,
+                sequence=envelope.sequence,
+                stamp_ns=envelope.stamp_ns,
+                frame_id=self._frame_id,
+                pose=scan.pose,
+            )
+            admitted.append(Admitted(envelope, scan, resolved))
+        return admitted
+
+    def _refuse(self, source: str, error: ProtocolError) -> None:
+        self._account.settle(source, f"rejected.{error.reason}")
+        self._account.complain(source, error.reason, str(error))
 
     def _is_first(self, envelope: Envelope, source: str) -> bool:
         if envelope.sequence:
             return self._applied.note(source, envelope.epoch, envelope.sequence).is_new
         stamp = envelope.stamp_ns.to_bytes(8, "little", signed=True)
-        digest = hashlib.blake2b(source.encode() + stamp, digest_size=16)
+        digest = hashlib.blake2b(source.encode() + stamp, digest_size=HASH_BYTES)
         digest.update(envelope.payload)
         known = digest.digest() in self._unnumbered
         self._unnumbered.add(digest.digest())
         return not known
+
+
+def _rank(envelope: Envelope) -> Rank:
+    if is_static(envelope):
+        return Rank.STATIC
+    return Rank.ODOMETRY if envelope.schema == ODOMETRY else Rank.TRANSFORM
+
+
+def _is_resolved(message: object) -> TypeGuard[ResolvedPose]:
+    return isinstance(message, ResolvedPose)

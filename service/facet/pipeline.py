@@ -7,12 +7,13 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from facet.admission import Admission
+from facet.admission import Admission, Admitted
 from facet.mapping.mapper import Mapper
 from facet.outgoing import Outgoing
 from facet.plausibility import Plausibility
 from facet.sinks import Message, Sink
 from facet.status import Account
+from facet_protocol import topics
 from facet_protocol.messages import Cut, Envelope, MapUpdate, Scan
 
 Tile = tuple[int, int, int]
@@ -62,11 +63,25 @@ class Pipeline:
         self.is_stale = other.is_stale
 
     def insert(self, envelope: Envelope) -> bool:
-        """Put one scan into the map, without deriving anything; False when it is left out."""
+        """Take one message, without deriving anything; False when it puts nothing into the map: it
+        is left out, it waits for its pose, or it is a pose that no scan waits for."""
         self.log_time_ns = max(self.log_time_ns, envelope.received_ns)
-        scan = self._admission.admit(envelope)
-        if scan is None:
-            return False
+        return self._apply(self._admission.admit(envelope))
+
+    def go_live(self) -> None:
+        """The log that was read ends here: what comes now is new."""
+        self._apply(self._admission.go_live())
+
+    def _apply(self, admitted: Sequence[Admitted]) -> bool:
+        for envelope, scan, resolved in admitted:
+            self._insert(envelope, scan)
+            if resolved is not None:
+                stamp_ns, topic = resolved.stamp_ns, topics.RESOLVED_TOPIC
+                said = self._outgoing.address(topic, resolved, stamp_ns, self.log_time_ns)
+                self._emit((said,))
+        return bool(admitted)
+
+    def _insert(self, envelope: Envelope, scan: Scan) -> None:
         inserted = self._mapper.insert(scan)
         self._count(scan, inserted.points_stored, inserted.rejected)
         for name, text in self._plausibility.oddities(scan, envelope.received_ns).items():
@@ -77,7 +92,6 @@ class Pipeline:
         self._applied[scan.source] = Applied(envelope, scan, num_scans)
         self.is_stale = True
         self._emit(((envelope, scan),))
-        return True
 
     def update(self) -> MapUpdate:
         """Derive everything that is stale, and send what changed."""
@@ -94,7 +108,10 @@ class Pipeline:
         return update
 
     def finish(self) -> None:
-        """Send what was held back: the last points, the last scene."""
+        """Settle what still waits for its pose; send what was held back: the last points, the last
+        scene."""
+        if self._apply(self._admission.finish()):
+            self.update()
         self._points_every_ns = min(self._points_every_ns, 1)
         self._emit(self._outgoing.finish(self.log_time_ns))
         self._send_points(None)

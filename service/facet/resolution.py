@@ -94,6 +94,17 @@ class Resolution:
             held = self._held[number]
             yield self._release(number, replace(held.scan, pose=resolved.pose))
 
+    def waiting(self) -> list[Envelope]:
+        """In the order in which they came."""
+        return [held.envelope for held in self._held.values()]
+
+    def go_live(self) -> Iterator[Settled]:
+        """The log has no more to say: what was found is taken as it is."""
+        self._logged = False
+        for number, held in list(self._held.items()):
+            if held.pose is not None:
+                yield self._give_up(number, "")
+
     def finish(self) -> Iterator[Settled]:
         """No more will come: what is placed goes, the rest is refused."""
         for number in list(self._held):

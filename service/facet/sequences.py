@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter, defaultdict
+from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 
 @dataclass(slots=True)
@@ -92,6 +93,32 @@ class SequenceLedger:
         self._skipped[source] += skipped
         self._late[source] += is_late
         return Noted(is_new, skipped, start + 1, is_late, is_restart, is_interleaved)
+
+    def freeze(self) -> dict[str, Any]:
+        """All of it, as JSON knows it."""
+        return {
+            source: {
+                "epochs": [[e, n.starts, n.ends] for e, n in epochs.items()],
+                "current": self._current[source],
+                "skipped": self._skipped[source],
+                "late": self._late[source],
+            }
+            for source, epochs in sorted(self._seen.items())
+            if epochs
+        }
+
+    @staticmethod
+    def thaw(frozen: Mapping[str, Any]) -> SequenceLedger:
+        """What was frozen. Raises KeyError, TypeError, ValueError for anything else."""
+        ledger = SequenceLedger()
+        for source, kept in frozen.items():
+            for epoch, starts, ends in kept["epochs"]:
+                numbers = Numbers(list(map(int, starts)), list(map(int, ends)))
+                ledger._seen[source][int(epoch)] = numbers
+            ledger._current[source] = int(kept["current"])
+            ledger._skipped[source] = int(kept["skipped"])
+            ledger._late[source] = int(kept["late"])
+        return ledger
 
     def missing(self, source: str | None = None) -> dict[str, int]:
         """Numbers that have not come, by source; a late arrival takes one away again."""
