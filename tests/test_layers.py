@@ -35,7 +35,7 @@ SHELL = Layer(
     "facet.status facet_protocol.*"
 )
 WIRING = Layer(  # the threads of the running service: they join sources and sinks by hand
-    f"{SHELL.ours} facet.intake facet.session facet.sinks.* facet.sources.*"
+    f"{SHELL.ours} facet.intake facet.robots facet.session facet.sinks.* facet.sources.*"
 )
 LAYERS = {  # the longest name that fits counts
     "facet_protocol": Layer(
@@ -59,6 +59,9 @@ LAYERS = {  # the longest name that fits counts
     "facet.config": Layer("", "pydantic"),
     "facet.frames": Layer("facet_protocol.*", pure=True),
     "facet.resolution": Layer("facet.frames facet_protocol.*", pure=True),
+    "facet.robots": Layer(
+        "facet.admission facet.config facet.sources.dialects facet.status facet_protocol.*"
+    ),
     "facet.session": Layer("facet.config", "zenoh"),
     "facet": SHELL,
     "facet.intake": WIRING,

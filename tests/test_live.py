@@ -9,7 +9,8 @@ from types import SimpleNamespace
 from typing import Any
 
 from facet.commands.play import RobotPublisher
-from facet.sources.live import Inbox, LiveSource, split_encoding
+from facet.sources.dialects import split_encoding
+from facet.sources.live import Inbox, LiveSource
 from facet.status import Account
 from facet_protocol import attachment
 from facet_protocol.messages import Envelope

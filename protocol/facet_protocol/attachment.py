@@ -1,8 +1,13 @@
-"""The 24 bytes beside every scan on Zenoh: magic, epoch, sequence, stamp. A loss shows as a gap."""
+"""What travels beside a message on Zenoh: epoch, sequence, stamp. A loss shows as a gap.
+
+Ours are 24 bytes. ROS 2 over rmw_zenoh has its own, in several layouts.
+"""
 
 from __future__ import annotations
 
+import re
 import struct
+import zlib
 from dataclasses import dataclass
 
 from facet_protocol.messages import ProtocolError
@@ -36,3 +41,25 @@ def unpack(data: bytes | memoryview) -> Attachment:
     if magic != MAGIC:
         raise ProtocolError(f"attachment starts {magic!r}, expected {MAGIC!r}", "bad_attachment")
     return Attachment(epoch, sequence, stamp_ns)
+
+
+_ROS = re.compile(  # with names in some releases, without in others; the length of the gid likewise
+    rb"(?:\x0fsequence_number)?(?P<sequence>.{8})(?:\x10source_timestamp)?(?P<stamp>.{8})"
+    rb"(?:\x0asource_gid)?\x10?(?P<gid>.{16})",
+    re.DOTALL,
+)
+
+
+def unpack_ros(data: bytes) -> Attachment:
+    """What rmw_zenoh sends beside a message; the epoch is made of the publisher's id.
+
+    Raises ProtocolError when the bytes are in none of the layouts that are known.
+    """
+    match = _ROS.fullmatch(data)
+    if match is None:
+        raise ProtocolError(f"attachment of {len(data)} bytes is not rmw_zenoh's", "bad_attachment")
+    (sequence,) = struct.unpack("<q", match["sequence"])
+    (stamp_ns,) = struct.unpack("<q", match["stamp"])
+    if sequence < 0:
+        raise ProtocolError(f"sequence number {sequence} is below 0", "bad_attachment")
+    return Attachment(zlib.crc32(match["gid"]) or 1, sequence, stamp_ns)

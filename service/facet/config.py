@@ -6,7 +6,7 @@ import difflib
 import tomllib
 from ipaddress import ip_address
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import Annotated, Any, Literal, TypeVar, get_args
 
 from pydantic import (
     BaseModel,
@@ -148,6 +148,26 @@ class RecordSection(Section):
     checkpoint_s: float = Field(default=60.0, ge=0.0)  # 0: only at the end, and when asked
 
 
+class RuleSection(Section):
+    """What messages of some keys are, or whose, where they do not say it themselves."""
+
+    key: Annotated[str, Field(pattern=r"^/?[^/]+(/[^/]+)*$")]  # key expression, or a topic of ROS
+    type: str = ""  # schema: sensor_msgs/msg/PointCloud2, foxglove.PointCloud, ...
+    robot: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{0,64}$")] = ""
+    sensor: Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{0,64}$")] = ""
+    frame: str = ""  # of a scan: the frame of its points; of a pose: the frame it is the pose of
+    envelope_field: int = Field(default=0, ge=0, le=536_870_911)  # the field that holds the message
+
+
+class RobotsSection(Section):
+    """Robots that do not speak Facet's own keys: which keys are listened to, and what they mean."""
+
+    keys: tuple[str, ...] = ("**",)  # key expressions; () leaves Facet's own alone
+    rules: tuple[RuleSection, ...] = ()  # the first that fits counts
+    wait_s: float = Field(default=0.5, gt=0.0, le=60.0)  # of stamps: for a pose, and between two
+    wait_bytes: int = Field(default=256 * MIB, ge=MIB, le=65536 * MIB)  # of scans that wait
+
+
 class PublishSection(Section):
     """What leaves over Zenoh."""
 
@@ -163,6 +183,7 @@ class Config(Section):
     map: MapSection = MapSection()
     mapping: MappingSection = MappingSection()
     network: NetworkSection = NetworkSection()
+    robots: RobotsSection = RobotsSection()
     queue: QueueSection = QueueSection()
     record: RecordSection = RecordSection()
     publish: PublishSection = PublishSection()
@@ -235,6 +256,7 @@ def _section(model: type[BaseModel], loc: tuple[Any, ...]) -> type[BaseModel]:
     for part in loc[:-1]:
         field = model.model_fields.get(str(part))
         annotation = field.annotation if field else None
+        annotation = next(iter(get_args(annotation)), annotation)  # of a list: what is in it
         if isinstance(annotation, type) and issubclass(annotation, BaseModel):
             model = annotation
     return model

@@ -4,22 +4,29 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 
-from facet.sources.naming import is_scan, robot_and_sensor
+from facet.sources.naming import is_input, is_scan, names_of
 from facet_protocol import topics
 from facet_protocol.codec import decode
-from facet_protocol.messages import Cut, Envelope, ProtocolError
+from facet_protocol.messages import Cut, Envelope, ProtocolError, ResolvedPose
 
 EVERY_NS = 200_000_000  # of log time, for a log that does not say
 Identity = tuple[str, str, int, int, int]  # robot, sensor, epoch, sequence, stamp
 
 
-def logged_cuts(
-    envelopes: Iterable[Envelope], has_cuts: Callable[[], bool]
-) -> Iterator[list[Envelope]]:
-    """The scans of each update as the log cut them; of a log without cuts, every 0.2 s of it.
+class Batch(list[Envelope]):
+    """The messages of one update. `revision` is that of the logged cut; 0 when none was logged."""
+
+    def __init__(self, envelopes: Iterable[Envelope], revision: int = 0) -> None:
+        super().__init__(envelopes)
+        self.revision = revision
+
+
+def logged_cuts(envelopes: Iterable[Envelope], has_cuts: Callable[[], bool]) -> Iterator[Batch]:
+    """The messages of each update as the log cut them; of a log without cuts, every 0.2 s of it.
 
     Scans between the last scan that a cut names and the cut itself belong to the next update: they
-    were recorded while this one was under way. `has_cuts` is asked once the first scan was read.
+    were recorded while this one was under way. A scan that waited for its pose belongs to the cut
+    that follows the record of it. `has_cuts` is asked once the first scan was read.
     """
     waiting: list[Envelope] = []
     cuts: list[Cut] = []
@@ -27,34 +34,41 @@ def logged_cuts(
         cut = _cut(envelope)
         if cuts and (cut is None or cut.revision != cuts[0].revision):
             taken, waiting = _split(waiting, cuts)
-            cuts = []
-            yield taken
+            revision, cuts = cuts[0].revision, []
+            yield Batch(taken, revision)
         if cut is not None:
             cuts.append(cut)
-        elif is_scan(envelope):
-            if waiting and not has_cuts() and _is_due(waiting[0], envelope, EVERY_NS):
-                yield waiting
+        elif _is_applied(envelope):
+            is_due = is_scan(envelope) and bool(waiting) and not has_cuts()
+            if is_due and _is_due(waiting[0], envelope, EVERY_NS):
+                yield Batch(waiting)
                 waiting = []
             waiting.append(envelope)
     if cuts:
         taken, waiting = _split(waiting, cuts)
-        yield taken
+        yield Batch(taken, cuts[0].revision)
     if waiting:
-        yield waiting
+        yield Batch(waiting)
 
 
 def timed_cuts(envelopes: Iterable[Envelope], every_ns: int) -> Iterator[list[Envelope]]:
-    """The scans of every `every_ns` of log time; 0: all of them at once."""
+    """The messages of every `every_ns` of log time; 0: all of them at once."""
     waiting: list[Envelope] = []
     for envelope in envelopes:
-        if not is_scan(envelope):
+        if not _is_applied(envelope):
             continue
-        if waiting and every_ns and _is_due(waiting[0], envelope, every_ns):
+        is_due = is_scan(envelope) and bool(waiting) and every_ns > 0
+        if is_due and _is_due(waiting[0], envelope, every_ns):
             yield waiting
             waiting = []
         waiting.append(envelope)
     if waiting:
         yield waiting
+
+
+def _is_applied(envelope: Envelope) -> bool:
+    """An input, or the record of a pose that was found for one."""
+    return is_input(envelope) or envelope.key == topics.RESOLVED_TOPIC
 
 
 def _is_due(first: Envelope, envelope: Envelope, every_ns: int) -> bool:
@@ -72,17 +86,32 @@ def _cut(envelope: Envelope) -> Cut | None:
 
 
 def _split(waiting: list[Envelope], cuts: list[Cut]) -> tuple[list[Envelope], list[Envelope]]:
-    """(applied before the cut, after it): up to the last scan that one of its rows names."""
+    """(applied before the cut, after it): up to the last scan that one of its rows names, or whose
+    pose was found before it, and the records of those poses."""
     named = {(c.robot, c.sensor, c.epoch, c.sequence, c.stamp_ns) for c in cuts}
+    named |= {identity for e in waiting if (identity := _resolved_identity(e)) is not None}
     end = 0
     for k, envelope in enumerate(waiting):
         identity = _identity(envelope)
-        if identity in named:
+        if identity in named and is_scan(envelope):
             named.discard(identity)  # a duplicate further on was left out
             end = k + 1
-    return waiting[:end], waiting[end:]
+    records = [e for e in waiting[end:] if e.key == topics.RESOLVED_TOPIC]
+    return waiting[:end] + records, [e for e in waiting[end:] if e.key != topics.RESOLVED_TOPIC]
+
+
+def _resolved_identity(envelope: Envelope) -> Identity | None:
+    if envelope.key != topics.RESOLVED_TOPIC:
+        return None
+    try:
+        message = decode(envelope)
+    except ProtocolError:
+        return None
+    if not isinstance(message, ResolvedPose):
+        return None
+    return message.robot, message.sensor, message.epoch, message.sequence, message.stamp_ns
 
 
 def _identity(envelope: Envelope) -> Identity:
-    robot, sensor = robot_and_sensor(envelope.key)
+    robot, sensor = names_of(envelope)
     return robot, sensor, envelope.epoch, envelope.sequence, envelope.stamp_ns

@@ -10,7 +10,7 @@ E  a rule                 the settings name the schema of a key, or whose it is
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from typing import NamedTuple
 
@@ -53,7 +53,7 @@ class Dialects:
         self.rules = tuple(rules)
         self._matches = [(key_pattern(rule.key), rule) for rule in rules]
         self._types: dict[str, str] = {}  # key: schema, as its token says
-        self._known: dict[tuple[str, str], Recognised | None] = {}
+        self._known: dict[tuple[str, ...], Recognised | None] = {}
 
     def learn(self, token: str) -> None:
         """A bridge says that it publishes a key."""
@@ -72,15 +72,21 @@ class Dialects:
 
     def recognise(self, key: str, encoding: str) -> Recognised | None:
         """A Zenoh sample by its key and its encoding; None: nothing that is read."""
-        name = (key, encoding)
-        known = self._known.get(name, name)
-        if known is not name:
-            return known  # type: ignore[return-value]  # `name` stands for absent
-        recognised = self._recognise(key, encoding)
-        if len(self._known) >= MAX_KNOWN:
-            self._known.clear()
-        self._known[name] = recognised
-        return recognised
+        return self._remember((key, encoding), lambda: self._recognise(key, encoding))
+
+    def recognise_channel(self, topic: str, schema: str, encoding: str) -> Recognised | None:
+        """A channel of a recording; None: its schema is to be taken as it is written."""
+        name = (topic, schema, encoding)
+        return self._remember(name, lambda: self._recognise_channel(*name))
+
+    def _remember(
+        self, name: tuple[str, ...], find: Callable[[], Recognised | None]
+    ) -> Recognised | None:
+        if name not in self._known:
+            if len(self._known) >= MAX_KNOWN:
+                self._known.clear()
+            self._known[name] = find()
+        return self._known.get(name)
 
     def _recognise(self, key: str, encoding: str) -> Recognised | None:
         schema, kind = split_encoding(encoding)
@@ -109,8 +115,7 @@ class Dialects:
             return None
         return Recognised(dialect, topic, schema, "cdr", self.rule_of(topic))
 
-    def recognise_channel(self, topic: str, schema: str, encoding: str) -> Recognised | None:
-        """A channel of a recording; None: its schema is to be taken as it is written."""
+    def _recognise_channel(self, topic: str, schema: str, encoding: str) -> Recognised | None:
         if topic.startswith(f"{PREFIX}/"):
             return Recognised(Dialect.NATIVE, topic, schema, encoding, self.rule_of(topic))
         rule = self.rule_of(topic)

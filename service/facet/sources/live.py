@@ -1,21 +1,32 @@
-"""Scans from Zenoh into a bounded queue of our own: Zenoh's threads only put them there."""
+"""Scans and poses from Zenoh into a bounded queue: Zenoh's threads only put them there."""
 
 from __future__ import annotations
 
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
 import zenoh
 import zenoh.ext
 
-from facet.sources.naming import robot_and_sensor, source_of
+from facet.sources.dialects import (
+    TOKENS_KEY,
+    Dialect,
+    Dialects,
+    Recognised,
+    key_pattern,
+    split_encoding,
+)
+from facet.sources.naming import is_input, is_static, names_of, source_of
 from facet_protocol import attachment
 from facet_protocol.messages import Envelope, Loss, ProtocolError
-from facet_protocol.topics import scans_key
+from facet_protocol.ros_definitions import TRANSFORMS
+from facet_protocol.topics import PREFIX, poses_keys, scans_key
+
+STATIC_KEYS = ("**/tf_static", "**/tf_static/tf2_msgs::msg::dds_::TFMessage_/*")
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,6 +36,19 @@ class Waiting:
     sample: zenoh.Sample
     received_ns: int
     num_bytes: int
+    what: Recognised
+
+    def envelope(self, payload: bytes = b"") -> Envelope:
+        """Without what the attachment says."""
+        what = self.what
+        return Envelope(
+            what.topic,
+            what.schema,
+            what.encoding,
+            payload,
+            received_ns=self.received_ns,
+            rule=what.rule,
+        )
 
 
 class Tally(Protocol):
@@ -50,6 +74,7 @@ class Inbox:
         tally: Tally | None = None,
     ) -> None:
         self.num_received = 0
+        self.num_ignored = 0  # samples on foreign keys that are no scans and no poses
         self.num_bytes = 0
         self._max_messages, self._max_bytes = max_messages, max_bytes
         self._max_message_bytes, self._patience_s = max_message_bytes, patience_s
@@ -64,13 +89,15 @@ class Inbox:
     def __len__(self) -> int:
         return len(self._waiting)
 
-    def push(self, sample: zenoh.Sample) -> None:
-        """Called on Zenoh's threads: appends, and may hold them back for a while."""
-        waiting = Waiting(sample, self._clock_ns(), len(sample.payload))
+    def push(self, sample: zenoh.Sample, what: Recognised | None = None) -> None:
+        """Called on Zenoh's threads: appends, and may hold them back for a while. `what` was
+        recognised; a native sample says it itself."""
+        what = what or native(sample)
+        waiting = Waiting(sample, self._clock_ns(), len(sample.payload), what)
         with self._changed:
             self.num_received += 1
             if self._tally is not None:
-                self._tally.arrive(source_of(str(sample.key_expr)))
+                self._tally.arrive(source_of(waiting.envelope()))
             if waiting.num_bytes > self._max_message_bytes:
                 self._drop(waiting, "too_large")
                 return
@@ -125,7 +152,7 @@ class Inbox:
     def _drop(self, waiting: Waiting, reason: str) -> None:
         envelope = envelope_of(waiting, b"")
         if self._tally is not None:
-            self._tally.settle(source_of(envelope.key), reason)
+            self._tally.settle(source_of(envelope), reason)
         loss = loss_of(envelope, envelope.sequence, 1, reason)
         last = self._shed[-1] if self._shed else None
         if last is not None and _continues(last, loss):
@@ -141,45 +168,134 @@ class Inbox:
 
 
 class LiveSource:
-    """Subscribes to every scan of a map. What a stall made us miss is asked for again."""
+    """Subscribes to every scan and pose of a map's robots, whatever they speak.
 
-    def __init__(self, session: zenoh.Session, map_id: str, inbox: Inbox) -> None:
-        self._subscriber = zenoh.ext.declare_advanced_subscriber(
-            session,
-            scans_key(map_id),
-            zenoh.handlers.Callback(inbox.push, indirect=False),
-            recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
-        )
+    What a stall made us miss on Facet's own keys is asked for again; static transforms are asked
+    for when we come late. `keys` are the foreign keys that are listened to: what is recognised
+    there by the dialect table is taken, the rest is left alone.
+    """
+
+    def __init__(
+        self,
+        session: zenoh.Session,
+        map_id: str,
+        inbox: Inbox,
+        dialects: Dialects | None = None,
+        keys: Sequence[str] = (),
+    ) -> None:
+        self._session, self._inbox = session, inbox
+        self._dialects = dialects or Dialects()
+        self._patterns = [key_pattern(key) for key in keys]
+        static = poses_keys(map_id, static=True)
+        self._closers: list[Callable[[], object]] = []
+        for key in (scans_key(map_id), *poses_keys(map_id), *static):
+            self._subscribe(key, self._take_native, with_history=key in static)
+        if keys:
+            tokens = zenoh.handlers.Callback(self._note_token, indirect=False)
+            watch = session.liveliness().declare_subscriber(TOKENS_KEY, tokens, history=True)
+            self._closers.append(watch.undeclare)
+            for key in STATIC_KEYS:
+                self._subscribe(key, self._take_foreign_static, with_history=True)
+        for key in keys:
+            handler = zenoh.handlers.Callback(self._take_foreign, indirect=False)
+            plain = session.declare_subscriber(key, handler, allowed_origin=zenoh.Locality.REMOTE)
+            self._closers.append(plain.undeclare)
 
     def close(self) -> None:
         """No push after this. Must come before the session's close."""
-        self._subscriber.undeclare()
+        while self._closers:
+            self._closers.pop()()
+
+    def _subscribe(
+        self, key: str, take: Callable[[zenoh.Sample], None], *, with_history: bool
+    ) -> None:
+        history = zenoh.ext.HistoryConfig(detect_late_publishers=True) if with_history else None
+        subscriber = zenoh.ext.declare_advanced_subscriber(
+            self._session,
+            key,
+            zenoh.handlers.Callback(take, indirect=False),
+            history=history,
+            recovery=zenoh.ext.RecoveryConfig(heartbeat=True, periodic_queries=None),
+        )
+        self._closers.append(subscriber.undeclare)
+
+    def _note_token(self, sample: zenoh.Sample) -> None:
+        """A bridge begins to publish a key, or ends it."""
+        token = str(sample.key_expr)
+        if sample.kind == zenoh.SampleKind.PUT:
+            self._dialects.learn(token)
+        else:
+            self._dialects.forget(token)
+
+    def _take_native(self, sample: zenoh.Sample) -> None:
+        self._inbox.push(sample, self._dialects.recognise(*_names(sample)))
+
+    def _take_foreign(self, sample: zenoh.Sample) -> None:
+        """What lies on any other key: static transforms come by a way of their own."""
+        what = self._wanted(sample)
+        if what is None:
+            self._inbox.num_ignored += not str(sample.key_expr).startswith(f"{PREFIX}/")
+        elif not _is_static(what):
+            self._inbox.push(sample, what)
+
+    def _take_foreign_static(self, sample: zenoh.Sample) -> None:
+        what = self._wanted(sample)
+        key = f"/{sample.key_expr}"
+        is_ours = any(pattern.fullmatch(key) for pattern in self._patterns)
+        if what is not None and is_ours and _is_static(what):
+            self._inbox.push(sample, what)
+
+    def _wanted(self, sample: zenoh.Sample) -> Recognised | None:
+        what = self._dialects.recognise(*_names(sample))
+        if what is None or what.dialect is Dialect.NATIVE:
+            return None
+        is_read = is_input(Envelope(what.topic, what.schema, what.encoding, b"", rule=what.rule))
+        return what if is_read else None
+
+
+def native(sample: zenoh.Sample) -> Recognised:
+    """What a sample says itself, by its encoding."""
+    key, encoding = _names(sample)
+    return Recognised(Dialect.NATIVE, key, *split_encoding(encoding), None)
+
+
+def _names(sample: zenoh.Sample) -> tuple[str, str]:
+    return str(sample.key_expr), str(sample.encoding)
+
+
+def _is_static(what: Recognised) -> bool:
+    return is_static(Envelope(what.topic, what.schema, what.encoding, b""))
 
 
 def envelope_of(waiting: Waiting, payload: bytes) -> Envelope:
-    """The sample as an envelope; one without our attachment has no sequence and its receipt as
-    stamp."""
+    """The sample as an envelope; one without an attachment that we know has no sequence, and its
+    receipt as stamp."""
     sample = waiting.sample
-    schema, encoding = split_encoding(str(sample.encoding))
-    try:
-        mark = attachment.unpack(sample.attachment.to_bytes() if sample.attachment else b"")
-    except ProtocolError:
-        mark = attachment.Attachment(epoch=0, sequence=0, stamp_ns=waiting.received_ns)
-    return Envelope(
-        key=str(sample.key_expr),
-        schema=schema,
-        encoding=encoding,
-        payload=payload,
+    mark = _attachment_of(waiting, sample.attachment.to_bytes() if sample.attachment else b"")
+    return replace(
+        waiting.envelope(payload),
         stamp_ns=max(mark.stamp_ns, 0),
         epoch=mark.epoch,
         sequence=mark.sequence,
-        received_ns=waiting.received_ns,
     )
+
+
+def _attachment_of(waiting: Waiting, data: bytes) -> attachment.Attachment:
+    what = waiting.what
+    try:
+        if what.dialect is not Dialect.RMW_ZENOH:
+            return attachment.unpack(data)
+        mark = attachment.unpack_ros(data)
+    except ProtocolError:
+        return attachment.Attachment(epoch=0, sequence=0, stamp_ns=waiting.received_ns)
+    if what.schema == TRANSFORMS:  # many publish them on one topic: their numbers say nothing
+        return attachment.Attachment(epoch=0, sequence=0, stamp_ns=mark.stamp_ns)
+    return mark
 
 
 def loss_of(envelope: Envelope, first_sequence: int, count: int, reason: str) -> Loss:
     """A gap in the numbers of the envelope's source."""
-    robot, sensor = robot_and_sensor(envelope.key)
+    robot, sensor = names_of(envelope)
     return Loss(robot, sensor, envelope.epoch, first_sequence, count, reason, envelope.received_ns)
 
 
@@ -190,9 +306,3 @@ def _continues(last: Loss, loss: Loss) -> bool:
         last.first_sequence + last.count if loss.first_sequence else 0
     )
     return same and follows
-
-
-def split_encoding(text: str) -> tuple[str, str]:
-    """(schema, encoding) of `application/protobuf;foxglove.PointCloud`."""
-    kind, _, schema = text.partition(";")
-    return schema, kind.removeprefix("application/")

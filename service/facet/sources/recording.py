@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
+from facet.sources.dialects import Dialects
 from facet.sources.mcap_stream import Damage, LogError, LogMessage, McapStream
-from facet.sources.naming import is_scan
+from facet.sources.naming import is_input
 from facet_protocol import topics
 from facet_protocol.messages import Envelope
 
@@ -14,7 +15,9 @@ from facet_protocol.messages import Envelope
 class Recording:
     """The messages of one or more MCAP files, in the order given. Iterate it once."""
 
-    def __init__(self, paths: Sequence[Path]) -> None:
+    def __init__(self, paths: Sequence[Path], dialects: Dialects | None = None) -> None:
+        """`dialects`: with rules for topics that do not say what they are."""
+        self._dialects = dialects or Dialects()
         self.paths = [file for path in paths for file in _files(path)]
         self.damage: dict[Path, Damage] = {}
         self.metadata: dict[str, dict[str, str]] = {}  # of the file being read, by name
@@ -27,7 +30,7 @@ class Recording:
             for message in stream.messages():
                 self.metadata.update((m.name, m.metadata) for m in stream.metadata)
                 stream.metadata.clear()
-                yield envelope_of(message)
+                yield envelope_of(message, self._dialects, is_own="facet" in self.metadata)
             self.metadata.update((m.name, m.metadata) for m in stream.metadata)
 
     def head(self) -> dict[str, str]:
@@ -46,24 +49,39 @@ class Recording:
         return self.metadata.get("facet", {}).get("cuts") == "logged"
 
 
-def envelope_of(message: LogMessage) -> Envelope:
-    """The message as it travelled; the epoch, and what MCAP's 32 bits lack, are the channel's."""
-    metadata = message.channel.metadata
+def envelope_of(
+    message: LogMessage, dialects: Dialects | None = None, *, is_own: bool = True
+) -> Envelope:
+    """The message as it travelled; the epoch, and what MCAP's 32 bits lack, are the channel's.
+
+    `is_own`: Facet wrote the file, and so its transforms.
+    """
+    channel, metadata = message.channel, message.channel.metadata
+    schema, encoding, rule = message.schema, channel.message_encoding, None
+    found = (dialects or Dialects()).recognise_channel(channel.topic, schema, encoding)
+    if found is not None:
+        schema, encoding, rule = found.schema, found.encoding, found.rule
+    is_drawn = channel.topic == topics.TF_TOPIC and encoding == "protobuf"
     return Envelope(
-        key=message.channel.topic,
-        schema=message.schema,
-        encoding=message.channel.message_encoding,
+        key=channel.topic,
+        schema=schema,
+        encoding=encoding,
         payload=message.payload,
         stamp_ns=message.publish_time_ns,
         epoch=_number(metadata.get("epoch")),
         sequence=message.sequence + (_number(metadata.get("sequence_high")) << 32),
         received_ns=message.log_time_ns,
+        rule=rule,
+        is_derived=is_own and is_drawn,
     )
 
 
 def is_replayed(envelope: Envelope) -> bool:
-    """Whether replay reads it: scans, cuts and losses; the rest was derived from them."""
-    return is_scan(envelope) or envelope.key in (topics.CUT_TOPIC, topics.LOSS_TOPIC)
+    """Whether replay reads it: scans, poses, cuts and losses; the rest was derived from them."""
+    return is_input(envelope) or envelope.key in _READ
+
+
+_READ = (topics.CUT_TOPIC, topics.LOSS_TOPIC, topics.RESOLVED_TOPIC)
 
 
 def paced(
