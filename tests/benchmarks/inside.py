@@ -67,6 +67,11 @@ def num_blocks(mapper: Mapper) -> int:
     return int(mapper._store.num_blocks)
 
 
+def outline_tiles(mapper: Mapper) -> int:
+    """(u, v) tiles of all planes."""
+    return sum(len(contour.cells) for contour in mapper._contours.contours.values())
+
+
 def cells_passed(mapper: Mapper) -> int:
     """How many times a beam passed a cell."""
     return int(mapper._free.cells()[1].sum(dtype=np.int64))
