@@ -46,11 +46,15 @@ class Line:
     def take(self, envelopes: Iterable[Envelope]) -> Line:
         for envelope in envelopes:
             self._recorder.write(envelope)
-            self.account.arrive(source_of(envelope.key))
+            self.account.arrive(source_of(envelope))
             self._pipeline.insert(envelope)
             assert self.account.balance().is_exact
         self._recorder.commit()
         return self
+
+    def finish(self) -> None:
+        """No message will come any more."""
+        self._pipeline.finish()
 
     def state(self) -> str:
         return state_digest(self.mapper._store, self.mapper._free)

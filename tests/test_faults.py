@@ -3,6 +3,7 @@ leaves no trace in the map; the other robots go on."""
 
 from __future__ import annotations
 
+import logging
 import time
 import tracemalloc
 from collections.abc import Callable
@@ -47,6 +48,10 @@ def moved(x: float) -> Envelope:
     )
 
 
+def framed(frame_id: str) -> Envelope:
+    return scan_envelope(replace(small_scan(5), frame_id=frame_id))
+
+
 def field(name: str, **values: Any) -> Callable[[Any], None]:
     """Spoil one field of a cloud's layout."""
 
@@ -78,6 +83,8 @@ LEFT_OUT: dict[str, tuple[list[Envelope], str]] = {
     "F10-inf": ([moved(float("inf")), moved(-float("inf"))], "bad_pose"),
     "F12-zero": ([turned(0.0, 0.0, 0.0, 0.0)], "bad_quaternion"),
     "F12-off": ([turned(0.0, 0.0, 0.0, 1.0011)], "bad_quaternion"),
+    "F13-unknown": ([framed("odom")], "wrong_frame"),
+    "F13-none": ([framed("")], "wrong_frame"),
     "F16-nanos": ([changed(lambda m: setattr(m.timestamp, "nanos", 1_000_000_000))], "bad_stamp"),
 }
 
@@ -157,6 +164,26 @@ def test_f11_a_quaternion_a_little_off_is_renormalised(tmp_path: Path) -> None:
     assert line.account[f"renormalised[{SOURCE}]"] == line.account["renormalised"] == 1
     assert line.account.balance().rejected == 0
     assert line.state() == Line(tmp_path / "exact").take(around([GOOD])).state()
+
+
+def test_f14_a_scan_waits_for_its_pose_and_then_no_longer(tmp_path: Path, caplog: Log) -> None:
+    """In flight while it waits, bounded in stamps; then `no_pose`, and no trace in the map."""
+
+    def poseless(message: Any) -> None:
+        message.ClearField("pose")
+        message.frame_id = "lidar"
+
+    clean = Line(tmp_path / "clean").take(around([]))
+    line = Line(tmp_path / "spoiled").take(around([changed(poseless)]))
+    assert line.account.balance(SOURCE).in_flight == 1
+    with caplog.at_level(logging.WARNING):
+        line.finish()
+    assert line.account[f"rejected.no_pose[{SOURCE}]"] == 1
+    assert line.account.balance().in_flight == 0
+    assert line.account.balance().is_exact
+    assert len(lines(caplog, "no_pose")) == 1
+    assert line.state() == clean.state()
+    assert line.account["applied[r2/lidar]"] == 2
 
 
 def oddly(tmp_path: Path, caplog: Log, odd: list[Envelope], name: str) -> Line:
