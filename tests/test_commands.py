@@ -30,7 +30,7 @@ from rig import free_endpoint, room, wait_until
 
 COMMANDS = (
     *("run", "play", "status", "top", "cmd", "replay", "simulate"),
-    *("export", "info", "digest", "demo", "import"),
+    *("export", "info", "digest", "recover", "demo", "import"),
 )
 DATA = Path(__file__).parents[2] / "shared" / "data"
 

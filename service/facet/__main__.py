@@ -13,6 +13,7 @@ from facet.commands.export import export
 from facet.commands.imports import import_
 from facet.commands.inspect import digest, info
 from facet.commands.play import play
+from facet.commands.recover import recover
 from facet.commands.replay import replay
 from facet.commands.run import run
 from facet.commands.simulate import simulate
@@ -31,7 +32,7 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-LIVE, FILES = (run, play, status, top, cmd), (replay, simulate, export, info, digest, demo)
+LIVE, FILES = (run, play, status, top, cmd), (replay, simulate, export, info, digest, recover, demo)
 for command in (*LIVE, *FILES):
     app.command()(command)
 app.command("import")(import_)

@@ -6,10 +6,11 @@ from collections import Counter
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from facet.checkpoint import is_checkpoint, read_checkpoint
 from facet.commands.terminal import Exit, err, existing, megabytes, out, table
 from facet.config import Config
 from facet.sequences import SequenceLedger
@@ -18,6 +19,9 @@ from facet.sources.recording import Recording
 from facet_protocol import topics
 from facet_protocol.codec import decode
 from facet_protocol.messages import Envelope, Loss, ProtocolError
+
+if TYPE_CHECKING:
+    from facet.mapping.digest import Digest
 
 
 @dataclass(slots=True)
@@ -69,9 +73,11 @@ class Contents:
 
 
 def info(
-    file: Annotated[Path, typer.Argument(help="A log (.mcap), a folder of them, or model.json.")],
+    file: Annotated[
+        Path, typer.Argument(help="A log (.mcap), a folder of them, model.json or a checkpoint.")
+    ],
 ) -> None:
-    """What is in a log or a model, and what was lost.
+    """What is in a log, a model or a checkpoint, and what was lost.
 
     \b
     facet info out/log
@@ -82,6 +88,9 @@ def info(
     existing([file])
     if file.suffix == ".json":
         _model_info(file)
+        return
+    if is_checkpoint(file):
+        _checkpoint_info(file)
         return
     recording, contents = Recording([file]), Contents()
     for envelope in recording:
@@ -116,6 +125,26 @@ def _print_contents(recording: Recording, contents: Contents) -> None:
     for path, damage in recording.damage.items():
         for note in damage.notes:
             err.print(f"damage: {path}: {note}")
+        if damage.is_lossy:
+            err.print(
+                f"damage: {path}: {damage}; `facet recover` writes what is whole to a new file"
+            )
+
+
+def _checkpoint_info(path: Path) -> None:
+    checkpoint = read_checkpoint(path)
+    header = checkpoint.header
+    num_bytes = sum(array.nbytes for array in checkpoint.arrays.values())
+    rows = [
+        ("map", header.get("map", "")),
+        ("version", header.get("version", "")),
+        ("revision", header.get("revision", "")),
+        ("log", f"{header['log']['file']} up to byte {header['log']['offset']:,}"),
+        *((f"newest of {source}", number) for source, _, number in header.get("newest", [])),
+        ("size", megabytes(num_bytes)),
+        *sorted(header.get("settings", {}).items()),
+    ]
+    table(str(path), ("what", "value"), rows)
 
 
 def _rate(channel: Channel) -> str:
@@ -149,13 +178,16 @@ def _model_info(path: Path) -> None:
 
 
 def digest(
-    file: Annotated[Path, typer.Argument(help="A log (.mcap), a folder of them, or model.json.")],
+    file: Annotated[
+        Path, typer.Argument(help="A log (.mcap), a folder of them, model.json or a checkpoint.")
+    ],
 ) -> None:
     """The two hashes of a map: of its state, and of what is derived from it.
 
     \b
     facet digest out/log                # replays it
     facet digest out/log/model.json     # computes the derived hash again from the file
+    facet digest out/log/map.checkpoint # of the map that it keeps
 
     Equal scans give equal digests, in whatever order they came. Exit code 65: a model that does
     not hash to what it says.
@@ -163,14 +195,22 @@ def digest(
     existing([file])
     if file.suffix == ".json":
         raise typer.Exit(_model_digest(file))
+    if is_checkpoint(file):
+        from facet.resume import thaw_checkpoint
+
+        _print_digest(thaw_checkpoint(file)[1].digest())
+        return
     from facet.commands.replay import replay_log, require_scans
 
     result = replay_log([file], Config(), update_every="end")
     require_scans(result)
-    hashes = result.mapper.digest()
+    _print_digest(result.mapper.digest())
+    raise typer.Exit(result.exit_code)
+
+
+def _print_digest(hashes: Digest) -> None:
     out.print(f"state   {hashes.state}")
     out.print(f"derived {hashes.derived}")
-    raise typer.Exit(result.exit_code)
 
 
 def _model_digest(path: Path) -> Exit:

@@ -8,7 +8,8 @@ from pathlib import Path
 from mcap.writer import CompressionType, Writer
 
 from facet.sinks.durable_file import DurableFile
-from facet_protocol.codec import Message, descriptor_set
+from facet_protocol import codec
+from facet_protocol.codec import Message
 from facet_protocol.messages import Envelope, ProtocolError, Scan, TilePoints
 from facet_protocol.metadata import signed
 
@@ -96,12 +97,16 @@ class LogFile:
 
     def _schema(self, name: str) -> int:
         if name not in self._schemas:
-            try:
-                encoding, data = "protobuf", descriptor_set(name)
-            except ProtocolError:  # recorded all the same, by name
-                encoding, data = "", b""
-            self._schemas[name] = self._writer.register_schema(name, encoding, data)
+            self._schemas[name] = self._writer.register_schema(name, *schema_text(name))
         return self._schemas[name]
+
+
+def schema_text(name: str) -> tuple[str, bytes]:
+    """(encoding, text) of a schema; empty for one that we do not know: recorded by name alone."""
+    try:
+        return codec.schema_text(name)
+    except ProtocolError:
+        return "", b""
 
 
 def channel_metadata(name: ChannelName) -> dict[str, str]:

@@ -38,21 +38,37 @@ class Definitions:
         if self.num_bytes > MAX_DEFINITION_BYTES:
             raise ValueError(f"over {MAX_DEFINITION_BYTES} bytes of definitions")
 
-    def add(self, channels: Iterable[Channel], schemas: Iterable[Schema]) -> None:
-        self.channels.update((c.id, c) for c in channels)
-        self.schemas.update((s.id, s) for s in schemas)
-
-    def find(self, channel_id: int) -> tuple[Channel, str]:
-        """A channel and the name of its schema. Raises ValueError when either is not defined."""
+    def find(self, channel_id: int) -> tuple[Channel, Schema | None]:
+        """A channel and its schema, if it has one. Raises ValueError when either is not defined."""
         channel = self.channels.get(channel_id)
         if channel is None:
             raise ValueError(f"no channel {channel_id}")
         if not channel.schema_id:
-            return channel, ""
+            return channel, None
         schema = self.schemas.get(channel.schema_id)
         if schema is None:
             raise ValueError(f"no schema {channel.schema_id}")
-        return channel, schema.name
+        return channel, schema
+
+
+def defined(rows: Iterable[tuple[str, str, dict[str, str], str, str, bytes]]) -> Definitions:
+    """Channels (topic, encoding, metadata) with their schemas (name, encoding, text), both numbered
+    as the library's writer numbers them: from 1, as they came, each schema once."""
+    definitions = Definitions()
+    schemas: dict[str, int] = {}
+    for number, (topic, encoding, metadata, name, kind, text) in enumerate(rows, start=1):
+        if name and name not in schemas:
+            schemas[name] = len(schemas) + 1
+            schema = Schema(data=text, encoding=kind, id=schemas[name], name=name)
+            definitions.schemas[schema.id] = schema
+        definitions.channels[number] = Channel(
+            id=number,
+            topic=topic,
+            message_encoding=encoding,
+            metadata=metadata,
+            schema_id=schemas.get(name, 0),
+        )
+    return definitions
 
 
 def _keep(table: dict[int, Schema] | dict[int, Channel], key: int, value: Schema | Channel) -> None:

@@ -17,7 +17,7 @@ from typing import BinaryIO
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, DataEnd, Metadata, Statistics
+from mcap.records import Channel, DataEnd, Metadata, Schema, Statistics
 
 from facet.sources.mcap_chunk import (
     HEAD,
@@ -56,11 +56,16 @@ class LogMessage:
     """One message as the file holds it."""
 
     channel: Channel
-    schema: str  # name; "" when the channel has none
+    schema_record: Schema | None
     payload: memoryview
     sequence: int
     log_time_ns: int
     publish_time_ns: int
+
+    @property
+    def schema(self) -> str:
+        """The name of its schema; "" when the channel has none."""
+        return self.schema_record.name if self.schema_record else ""
 
 
 @dataclass(slots=True)
@@ -70,6 +75,12 @@ class Damage:
     notes: list[str] = field(default_factory=list)
     lost_messages: int = 0  # as far as the file itself still says
     lost_bytes: int = 0
+    is_doubtful: bool = False  # what was read may be wrong, and it cannot be told where
+
+    @property
+    def is_lossy(self) -> bool:
+        """More than the file's end or its index is missing."""
+        return bool(self.lost_messages or self.lost_bytes or self.is_doubtful)
 
     def add(self, offset: int, num_bytes: int, reason: str) -> None:
         self.lost_bytes += num_bytes
@@ -296,6 +307,7 @@ class McapStream:
             if crc != self._crc:
                 text = "the checksum of all messages is wrong: one is not as it was written"
                 self.damage.add(0, 0, text)
+                self.damage.is_doubtful = True
             else:
                 self.num_unchecked = 0
 
@@ -350,6 +362,7 @@ class McapStream:
         elif missing < 0:
             text = f"{-missing} messages more than were written: which ones cannot be told"
             self.damage.add(self._size, 0, text)
+            self.damage.is_doubtful = True
         if statistics.chunk_count != self.num_chunks:
             text = f"{self.num_chunks} chunks of {statistics.chunk_count} that were written"
             self.damage.add(self._size, 0, text)
