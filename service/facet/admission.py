@@ -114,6 +114,11 @@ class Admission:
             self._refuse(source, error)
             return []
 
+    @property
+    def num_waiting(self) -> int:
+        """Scans that wait for their pose."""
+        return len(self._resolution)
+
     def finish(self) -> list[Admitted]:
         """No message will come any more: what waits is placed now, or refused."""
         return self._take(self._resolution.finish())

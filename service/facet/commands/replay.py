@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from facet.admission import Admission
 from facet.commands.play import parse_speed
 from facet.commands.settings import (
     DetailOption,
@@ -25,8 +24,9 @@ from facet.commands.terminal import Exit, InputError, err, existing, out, progre
 from facet.config import Config, load_config
 from facet.cuts import logged_cuts, timed_cuts
 from facet.outgoing import Outgoing
+from facet.robots import admission_of, dialects_of, recorded_robots, says_poses
 from facet.sinks import Sink
-from facet.sources.naming import is_scan, source_of
+from facet.sources.naming import is_input, is_scan, source_of
 from facet.sources.recording import Recording, is_replayed, paced
 from facet.status import Account
 from facet_protocol.messages import Envelope
@@ -85,16 +85,16 @@ def replay_log(
     on_scan: Callable[[int], None] = lambda num: None,
 ) -> Replayed:
     """Rebuild a map from logs. `sinks` see what those of a running service see."""
-    recording = Recording(existing(logs))
-    head = recording.head()
+    head = Recording(existing(logs)).head()
     config = _as_recorded(config, head)
+    recording = Recording(logs, dialects_of(config.robots))
     mapper = make_mapper(config, recorded_settings(head))
     account = Account()
     from facet.pipeline import Pipeline
 
     pipeline = Pipeline(
         mapper,
-        Admission(account, config.map.frame, mapper.settings.reach_m),
+        admission_of(config, account, mapper.settings.reach_m, logged=says_poses(head)),
         account,
         sinks,
         Outgoing(config.map.id, config.map.frame),
@@ -107,9 +107,10 @@ def replay_log(
     num = 0
     for batch in _batches(envelopes, update_every, recording):
         for envelope in batch:
-            account.arrive(source_of(envelope.key))
+            if is_input(envelope):
+                account.arrive(source_of(envelope))
             pipeline.insert(envelope)
-            num += 1
+            num += is_scan(envelope)
             on_scan(num)
         pipeline.update()
     pipeline.finish()
@@ -136,7 +137,7 @@ class _LogTimes:
 
 
 def _as_recorded(config: Config, head: dict[str, str]) -> Config:
-    """Map and frame as the log names them, where nothing else was asked for."""
+    """Map, frame and robots as the log names them, where nothing else was asked for."""
     default = Config().map
     names = {
         "id": head.get("map", default.id) if config.map.id == default.id else config.map.id,
@@ -144,7 +145,9 @@ def _as_recorded(config: Config, head: dict[str, str]) -> Config:
         if config.map.frame == default.frame
         else config.map.frame,
     }
-    return config.model_copy(update={"map": config.map.model_copy(update=names)})
+    robots = config.robots if config.robots != Config().robots else recorded_robots(head)
+    update = {"map": config.map.model_copy(update=names), "robots": robots}
+    return config.model_copy(update=update)
 
 
 def _batches(
