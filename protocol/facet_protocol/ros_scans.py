@@ -177,7 +177,8 @@ def _read_fan(
 ) -> tuple[Header, NDArray[np.float32], NDArray[np.float32], dict[str, int]]:
     header = read_header(reader)
     start, _, step, _, _, low, high = (float(n) for n in reader.numbers("7f"))
-    ranges = reader.floats().astype(np.float64)
+    with np.errstate(invalid="ignore"):  # a signalling NaN is a NaN
+        ranges = reader.floats().astype(np.float64)
     reader.floats()  # intensities
     reader.end()
     end = start + max(0, ranges.size - 1) * step
