@@ -173,7 +173,7 @@ def seen(
 
 def test_an_observable_is_a_rounded_view() -> None:
     told = seen([2, 1024, 0, 2046], (254, 0, 0))
-    assert told == {"centroid": (4, 0, 8), "votes": 2, "view": (7, 0, 0), "mixed": False, "pose": 0}
+    assert told == {"centroid": (4, 0, 8), "votes": 2, "view": (7, 1, 1), "mixed": False, "pose": 0}
     assert seen([1, 63, 64, 191], (0, 0, -127))["centroid"] == (0, 1, 1)
     assert seen([1, 63, 64, 192], (0, 0, -127))["centroid"] == (0, 1, 2)
     assert seen([20, 0, 0, 0], (0, 2540, 0))["votes"] == 8
@@ -187,10 +187,10 @@ def test_a_settled_voxel_is_rounded_to_quarters() -> None:
     assert seen([64, 64 * 120, 0, 0], (64 * 127, 0, 0))["centroid"] == (0, 0, 0)
 
 
-def test_a_direction_is_fine_where_it_tells_the_side() -> None:
-    grazing = seen([1, 0, 0, 0], (126, 0, 12))["view"]
-    assert grazing == (7, 0, 1)
-    assert seen([1, 0, 0, 0], (110, -64, 0))["view"] == (7, -4, 0)
+def test_a_direction_keeps_the_signs_that_tell_the_side() -> None:
+    assert seen([1, 0, 0, 0], (126, -1, 12))["view"] == (7, -1, 1)
+    assert seen([1, 0, 0, 0], (110, -64, 0))["view"] == (7, -4, 1)
+    assert seen([1, 0, 0, 0], (-90, -90, 1))["view"] == (-7, -7, 1)
 
 
 def test_a_voxel_seen_from_both_sides_is_mixed() -> None:

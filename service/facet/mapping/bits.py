@@ -24,6 +24,20 @@ def _trailing_zeros(typingctx: Any, word: Any) -> Any:
 trailing_zeros: Any = intrinsic(_trailing_zeros)
 
 
+def _population(typingctx: Any, word: Any) -> Any:
+    """Number of set bits of a uint64 (LLVM's ctpop)."""
+    del typingctx, word
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        del context, signature
+        return builder.ctpop(args[0])
+
+    return types.uint64(types.uint64), codegen
+
+
+population: Any = intrinsic(_population)
+
+
 @njit(cache=True, nogil=True)
 def box_mask(x0: int, x1: int, y0: int, y1: int) -> np.uint64:
     """Bits x + 8 y with x0 <= x <= x1 and y0 <= y <= y1 (all 0..7)."""

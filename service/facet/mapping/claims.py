@@ -14,49 +14,59 @@ from facet.mapping.blocks import CENTRE, find, pack, unpack
 LEFTOVER_REACH = 8  # voxels between a leftover and the box of the patch it joins
 CLAIM_REACH = 2  # voxels between a corner voxel and the box of a patch that claims it too
 PARALLEL_COS = 0.98
+HALF = 32.0  # 1/8 voxels: half a block
 CHUNK = 16  # blocks that a thread takes at a time
-REACH_BLOCKS = 2  # a label depends on patches so many blocks away
 CORNER_COS = 0.8  # planes that share a corner voxel differ by more than 37 degrees
 
 
 @njit(cache=True, nogil=True)
-def _add_candidates(patches, other, code, shift, count, codes, planes, boxes):  # type: ignore[no-untyped-def]
-    """Append the patches of block `other`: label, plane (unit normal, offset, weight of its size)
-    and box, in eighths from the corner of the block that asks. Returns how many there are now."""
+def _add_candidates(patches, other, code, shift, tolerance, count, codes, planes, boxes):  # type: ignore[no-untyped-def]
+    """Append the patches of block `other` whose plane comes within `tolerance` of the block that
+    asks: label, plane (unit normal, offset, weight of its size) and box, in eighths from the corner
+    of the block that asks. Returns how many there are now."""
     for p in range(patches.number[other]):
         if count == codes.shape[0]:
             break
         unit, votes = patches.unit[other, p], float(patches.votes[other, p])
         ux, uy, uz = float(unit[0]), float(unit[1]), float(unit[2])
-        length = np.sqrt(ux * ux + uy * uy + uz * uz)
-        offset = 0.0
-        for a in range(3):
-            planes[count, a] = unit[a] / length
-            middle = patches.centroid[other, p, a] / votes + shift[a]
-            offset += planes[count, a] * middle
-            boxes[count, a] = 8 * np.int64(patches.box[other, p, a]) + shift[a]
-            boxes[count, a + 3] = 8 * np.int64(patches.box[other, p, a + 3]) + 8 + shift[a]
+        one = 1.0 / np.sqrt(ux * ux + uy * uy + uz * uz)
+        ux, uy, uz = ux * one, uy * one, uz * one
+        centroid, size = patches.centroid[other, p], 1.0 / votes
+        offset = (
+            ux * (centroid[0] * size + shift[0])
+            + uy * (centroid[1] * size + shift[1])
+            + uz * (centroid[2] * size + shift[2])
+        )
+        beyond = abs(HALF * (ux + uy + uz) - offset) - HALF * (abs(ux) + abs(uy) + abs(uz))
+        if beyond > tolerance:
+            continue
+        planes[count, 0], planes[count, 1], planes[count, 2] = ux, uy, uz
         planes[count, 3] = offset
         planes[count, 4] = 1.0 / (1.0 + votes)
+        for a in range(3):
+            boxes[count, a] = 8 * np.int64(patches.box[other, p, a]) + shift[a]
+            boxes[count, a + 3] = 8 * np.int64(patches.box[other, p, a + 3]) + 8 + shift[a]
         codes[count] = code + p
         count += 1
     return count
 
 
 @njit(cache=True, nogil=True)
-def _near_candidates(blocks, patches, block, codes, planes, boxes):  # type: ignore[no-untyped-def]
+def _near_candidates(blocks, patches, block, tolerance, codes, planes, boxes):  # type: ignore[no-untyped-def]
     """Patches of a block and its 26 neighbours."""
     count = 0
     for n in range(27):
         other = block if n == CENTRE else blocks.neighbours[block, n]
         if other >= 0:
             shift = (64 * (n % 3 - 1), 64 * ((n // 3) % 3 - 1), 64 * (n // 9 - 1))
-            count = _add_candidates(patches, other, 16 * n, shift, count, codes, planes, boxes)
+            count = _add_candidates(
+                patches, other, 16 * n, shift, tolerance, count, codes, planes, boxes
+            )
     return count
 
 
 @njit(cache=True, nogil=True)
-def _far_candidates(blocks, patches, block, count, codes, planes, boxes):  # type: ignore[no-untyped-def]
+def _far_candidates(blocks, patches, block, tolerance, count, codes, planes, boxes):  # type: ignore[no-untyped-def]
     """Append the patches of the blocks two away: the other jamb of a door."""
     i, j, k = unpack(blocks.keys[block])
     for n in range(125):
@@ -66,7 +76,9 @@ def _far_candidates(blocks, patches, block, count, codes, planes, boxes):  # typ
         other = find(blocks.table_keys, blocks.table_values, pack(i + di, j + dj, k + dk))
         if other >= 0:
             shift = (64 * di, 64 * dj, 64 * dk)
-            count = _add_candidates(patches, other, 0, shift, count, codes, planes, boxes)
+            count = _add_candidates(
+                patches, other, 0, shift, tolerance, count, codes, planes, boxes
+            )
     return count
 
 
@@ -181,8 +193,8 @@ def _flat(planes, count):  # type: ignore[no-untyped-def]
 def label_blocks(blocks, observable, patches, which, tolerance, changed):  # type: ignore[no-untyped-def]
     """Label every voxel of the blocks `which` again; mark the blocks where a label changed.
 
-    Reads the patches of the blocks up to two away (REACH_BLOCKS); every block writes its own
-    voxels: threads change nothing."""
+    Reads the patches of the next blocks, and notes in patches.far where it had to ask those two
+    away; every block writes its own voxels: threads change nothing."""
     most = 125 * patches.votes.shape[1]
     chunks = (which.shape[0] + CHUNK - 1) // CHUNK
     for chunk in prange(chunks):
@@ -198,8 +210,8 @@ def label_blocks(blocks, observable, patches, which, tolerance, changed):  # typ
 @njit(cache=True, nogil=True)
 def _label_block(blocks, observable, patches, block, tolerance, codes, planes, boxes):  # type: ignore[no-untyped-def]
     """Label the voxels of one block. Whether a label changed."""
-    changed = False
-    near = _near_candidates(blocks, patches, block, codes, planes, boxes)
+    changed, far = False, False
+    near = _near_candidates(blocks, patches, block, tolerance, codes, planes, boxes)
     count = near
     flat = _flat(planes, near)
     for local in range(512):
@@ -221,8 +233,11 @@ def _label_block(blocks, observable, patches, block, tolerance, codes, planes, b
         if own >= 0 and not flat:
             c = _place(local, seen)
             other, alone = _claim(planes, boxes, near, count, c, tolerance, own)
-            if alone and count == near:
-                count = _far_candidates(blocks, patches, block, near, codes, planes, boxes)
+            if alone and not far:
+                far = True
+                count = _far_candidates(
+                    blocks, patches, block, tolerance, near, codes, planes, boxes
+                )
                 other, alone = _claim(planes, boxes, near, count, c, tolerance, own)
             if other >= 0:
                 second = codes[other]
@@ -230,4 +245,5 @@ def _label_block(blocks, observable, patches, block, tolerance, codes, planes, b
             patches.label[row] = label
             patches.second[row] = second
             changed = True
+    patches.far[block] = far
     return changed

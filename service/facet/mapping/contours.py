@@ -9,7 +9,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from facet.mapping.blocks import unpack
-from facet.mapping.pivot import CELLS, HALO, SIDE, boundary_edges
+from facet.mapping.pivot import CELLS, HALO, SIDE, boundary_edges, mark_changes
 from facet.mapping.rings import Outline, surfaces_of
 from facet.mapping.settings import STEPS, MapSettings
 from facet.mapping.store import VoxelStore
@@ -39,12 +39,9 @@ def make_frame(rounded: UnitNormal, voxel_m: float) -> PlaneFrame:
 
 
 @njit(cache=True, nogil=True)
-def _project(rows, owner, plane, blocks, block_of, local_of, observable, axis_u, axis_v, out):  # type: ignore[no-untyped-def]
-    """(u, v) in grid units of the voxels that `owner` gives to `plane`. Returns how many."""
-    count = 0
+def _project(rows, blocks, block_of, local_of, observable, axis_u, axis_v, out):  # type: ignore[no-untyped-def]
+    """(u, v) in grid units of voxels."""
     for m in range(rows.shape[0]):
-        if owner[m] != plane:
-            continue
         row = rows[m]
         i, j, k = unpack(blocks.keys[block_of[row]])
         local = local_of[row]
@@ -52,10 +49,8 @@ def _project(rows, owner, plane, blocks, block_of, local_of, observable, axis_u,
         x = 64 * i + 8 * (local & 7) + (seen & 15)
         y = 64 * j + 8 * ((local >> 3) & 7) + ((seen >> 4) & 15)
         z = 64 * k + 8 * (local >> 6) + ((seen >> 8) & 15)
-        out[count, 0] = np.floor(x * axis_u[0] + y * axis_u[1] + z * axis_u[2] + 0.5)
-        out[count, 1] = np.floor(x * axis_v[0] + y * axis_v[1] + z * axis_v[2] + 0.5)
-        count += 1
-    return count
+        out[m, 0] = np.floor(x * axis_u[0] + y * axis_u[1] + z * axis_u[2] + 0.5)
+        out[m, 1] = np.floor(x * axis_v[0] + y * axis_v[1] + z * axis_v[2] + 0.5)
 
 
 @njit(cache=True, nogil=True)
@@ -170,24 +165,23 @@ class ContourField:
                 stale |= old.places
             stale |= share.places
             contour.shares[member] = share
-        dirty = {place for place in sorted(stale) if self._repaint(contour, place)}
-        if not dirty:
+        near: dict[Place, NDArray[np.bool_]] = {}
+        for place in sorted(stale):
+            self._repaint(contour, place, near)
+        if not near or not self._roll(contour, near):
             return False
-        near = {(u + a, v + b) for u, v in dirty for a in (-1, 0, 1) for b in (-1, 0, 1)}
-        if self._roll(contour, sorted(near & (contour.cells.keys() | contour.edges.keys()))):
-            edges = [contour.edges[p] for p in sorted(contour.edges) if len(contour.edges[p])]
-            whole = np.concatenate(edges) if edges else np.zeros((0, 4), np.int32)
-            contour.outlines = surfaces_of(whole.astype(np.int64), self._least)
-            return True
-        return False
+        edges = [contour.edges[p] for p in sorted(contour.edges) if len(contour.edges[p])]
+        whole = np.concatenate(edges) if edges else np.zeros((0, 4), np.int32)
+        contour.outlines = surfaces_of(whole.astype(np.int64), self._least)
+        return True
 
     def _share(self, frame: PlaneFrame, store: VoxelStore, tile: Tile, plane: int) -> Share:
-        points = np.empty((len(tile.rows), 2), np.int32)
-        count = _project(
-            tile.rows, tile.owner, plane, store.blocks, store.columns.block, store.columns.local,
+        rows = tile.rows_of(plane)
+        points = np.empty((len(rows), 2), np.int32)
+        _project(
+            rows, store.blocks, store.columns.block, store.columns.local,
             store.columns.observable, frame.axis_u, frame.axis_v, points,
         )  # fmt: skip
-        points = points[:count].copy()
         keys = _places(points)
         places = frozenset(
             (int((k + (1 << 31)) >> 32), int(((k + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)))
@@ -195,37 +189,49 @@ class ContourField:
         )
         return Share(points, places)
 
-    def _repaint(self, contour: Contour, place: Place) -> bool:
-        """Draw a (u, v) tile again from all shares. Whether it changed."""
+    def _repaint(
+        self, contour: Contour, place: Place, near: dict[Place, NDArray[np.bool_]]
+    ) -> None:
+        """Draw a (u, v) tile again from all shares, and mark in `near`, by tile, the cells whose
+        edges may have changed by it."""
         cells = np.zeros((CELLS, CELLS), np.uint64)
         drawn = False
         for share in contour.shares.values():
             if place in share.places:
                 _paint(share.points, place[0], place[1], cells)
                 drawn = True
-        old = contour.cells.get(place)
+        old = contour.cells.get(place, _NOTHING)
         if drawn:
             contour.cells[place] = cells
         else:
             contour.cells.pop(place, None)
-        return old is None or not drawn or not np.array_equal(old, cells)
+        marked = np.zeros((SIDE, SIDE), np.bool_)
+        if not mark_changes(old, cells, marked):
+            return
+        for b, rows, own_rows in _PARTS:
+            for a, columns, own_columns in _PARTS:
+                if marked[rows, columns].any():
+                    other = (place[0] + a, place[1] + b)
+                    wanted = near.setdefault(other, np.zeros((CELLS, CELLS), np.bool_))
+                    wanted[own_rows, own_columns] |= marked[rows, columns]
 
-    def _roll(self, contour: Contour, places: list[Place]) -> bool:
-        """Find the boundary edges of tiles again. Whether any changed."""
+    def _roll(self, contour: Contour, near: dict[Place, NDArray[np.bool_]]) -> bool:
+        """Find the boundary edges that start in the cells `near` again. Whether any changed."""
+        places = sorted(near.keys() & (contour.cells.keys() | contour.edges.keys()))
         self.rolled += len(places)
-        moved = False
-        for place in places:
-            if place not in contour.cells:
-                old = contour.edges.pop(place, None)
-                moved |= old is not None and len(old) > 0
-        drawn = [place for place in places if place in contour.cells]
-        windows = np.zeros((len(drawn), SIDE, SIDE), np.uint64)
-        for window, place in zip(windows, drawn, strict=True):
+        windows = np.zeros((len(places), SIDE, SIDE), np.uint64)
+        for window, place in zip(windows, places, strict=True):
             self._fill(window, contour, place)
-        for place, edges in zip(drawn, boundary_edges(windows), strict=True):
-            edges += np.tile(np.array(place, np.int32) * SIZE, 2)
-            old = contour.edges.get(place)
-            moved |= old is None or not np.array_equal(old, edges)
+        wanted = np.array([near[place] for place in places]).reshape(-1, CELLS, CELLS)
+        moved = False
+        for place, new in zip(places, boundary_edges(windows, wanted), strict=True):
+            corner = np.tile(np.array(place, np.int32) * SIZE, 2)
+            old = contour.edges.get(place, _NO_EDGES)
+            u, v = (old[:, :2] - corner[:2]).T // STEPS
+            stays = ~near[place][v, u]
+            edges = np.concatenate([old[stays], new + corner])
+            edges = edges[np.lexsort(edges.T)]
+            moved |= not np.array_equal(old, edges)
             contour.edges[place] = edges
         return moved
 
@@ -239,7 +245,9 @@ class ContourField:
                     window[rows, columns] = cells[own_rows, own_columns]
 
 
-_PARTS = (
+_NOTHING = np.zeros((CELLS, CELLS), np.uint64)
+_NO_EDGES = np.zeros((0, 4), np.int32)
+_PARTS = (  # of a window: which tile, where in the window, and where in that tile
     (-1, slice(0, HALO), slice(CELLS - HALO, CELLS)),
     (0, slice(HALO, HALO + CELLS), slice(0, CELLS)),
     (1, slice(HALO + CELLS, 2 * HALO + CELLS), slice(0, HALO)),

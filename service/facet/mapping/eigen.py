@@ -8,20 +8,25 @@ from numba import njit
 
 @njit(cache=True, nogil=True)
 def eigenvalues(a, b, c, d, e, f):  # type: ignore[no-untyped-def]
-    """Eigenvalues, descending, of [[a, d, e], [d, b, f], [e, f, c]] (Smith 1961, closed form)."""
+    """Eigenvalues, descending, of [[a, d, e], [d, b, f], [e, f, c]] (Smith 1961, closed form).
+
+    The root furthest from the others is simple, so Newton's method finds it to the last bit; the
+    other two solve the quadratic that is left. No libm: the same bits on every machine."""
     q = (a + b + c) / 3.0
-    off = d * d + e * e + f * f
-    p2 = (a - q) * (a - q) + (b - q) * (b - q) + (c - q) * (c - q) + 2.0 * off
+    aa, bb, cc = a - q, b - q, c - q
+    p2 = (aa * aa + bb * bb + cc * cc + 2.0 * (d * d + e * e + f * f)) / 6.0
     if p2 <= 1e-300:
         return q, q, q
-    p = np.sqrt(p2 / 6.0)
-    aa, bb, cc = (a - q) / p, (b - q) / p, (c - q) / p
-    dd, ee, ff = d / p, e / p, f / p
-    half = 0.5 * (aa * (bb * cc - ff * ff) - dd * (dd * cc - ff * ee) + ee * (dd * ff - bb * ee))
-    angle = np.arccos(min(1.0, max(-1.0, half))) / 3.0
-    first = q + 2.0 * p * np.cos(angle)
-    third = q + 2.0 * p * np.cos(angle + 2.0943951023931953)
-    return first, 3.0 * q - first - third, third
+    p = np.sqrt(p2)
+    half = 0.5 * (aa * (bb * cc - f * f) - d * (d * cc - f * e) + e * (d * f - bb * e)) / (p2 * p)
+    h = min(1.0, abs(half))
+    t = 0.866058 + h * (0.165476 + h * (h * 0.009570 - 0.041071))  # cos(acos(h) / 3) to 3e-5
+    for _ in range(2):
+        t -= ((4.0 * t * t - 3.0) * t - h) / (12.0 * t * t - 3.0)
+    spread = 1.7320508075688772 * np.sqrt(max(0.0, 1.0 - t * t))
+    if half > 0.0:
+        return q + 2.0 * p * t, q + p * (spread - t), q - p * (spread + t)
+    return q + p * (t + spread), q + p * (t - spread), q - 2.0 * p * t
 
 
 @njit(cache=True, nogil=True)

@@ -93,14 +93,14 @@ class Mapper:
         touched = store.touched_rows.copy()
         dirty = store.settle()
         done("settle")
-        stale, turned = self._normals.update(store, dirty)
+        num_stale, turned = self._normals.update(store, dirty)
         done("normals")
+        moved = np.unique(store.columns.block[dirty])
         regrouped, relabelled, summed = self._patches.update(
-            store, self._normals.normals, np.union1d(turned, dirty), touched
+            store, self._normals.normals, np.union1d(turned, moved), touched
         )
         done("patches")
         limit = limits(self.settings, self._patches.sigma() / TICKS)
-        moved = np.unique(store.columns.block[dirty])
         grown, changed = self._tiles.update(
             store, self._patches, limit, regrouped, relabelled, summed, moved
         )
@@ -124,7 +124,7 @@ class Mapper:
         self.work = {
             "touched_voxels": len(touched),
             "dirty_voxels": len(dirty),
-            "stale_voxels": len(stale),
+            "stale_voxels": num_stale,
             "blocks_regrouped": len(regrouped),
             "blocks_relabelled": len(relabelled),
             "tiles_regrouped": len(grown),

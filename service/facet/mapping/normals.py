@@ -15,25 +15,30 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from facet.mapping.eigen import eigenvector
+from facet.mapping.bits import trailing_zeros
+from facet.mapping.eigen import eigenvalues, eigenvector
+from facet.mapping.halo import LISTS, Halo, gather, make_halos, take
 from facet.mapping.region import (
     COLUMNS,
     MOST,
     SUMS,
-    collect,
     covariance,
+    decode,
+    is_one_pose,
     shape,
     within,
     within_slab,
 )
 from facet.mapping.settings import STEPS, MapSettings
-from facet.mapping.staleness import deepen, find_stale, mark_dirty
+from facet.mapping.staleness import find_candidates, find_stale, mark_dirty
 from facet.mapping.store import VoxelStore
 
 EMPTY, VALID, ALIGNED, THICK, SPARSE, MIXED = range(6)
 CLASS_NAMES = ("empty", "valid", "aligned", "thick", "sparse", "mixed")
 UNIT = 256  # normals are integers: a unit vector times this
-CHUNK = 512  # voxels that a thread takes at a time
+SAME, CHANGED, WIDER = 0, 1, 255  # what became of a voxel; WIDER: it must look farther
+NARROW, WIDE = 4, 10  # voxels that the first and the second halo of a block reach beyond it
+SHARES = 8  # parts that the blocks are dealt out to; threads take them
 MIN_VOTES = 4  # fewer votes than this say nothing
 
 
@@ -105,7 +110,7 @@ def _step(sums, r, rule):  # type: ignore[no-untyped-def]
     growth = rule.growth[votes]
     ratio = 1e-3
     if sums[0] >= 4:
-        ratio, _, _ = shape(sums, rule.floor2)
+        ratio, _ = shape(eigenvalues(*covariance(sums)), rule.floor2)
     factor = 1.0 + rule.sigma_target / ratio - rule.w_sigma + rule.w_points * (growth - 1.0)
     factor = min(2.0, max(0.5, factor))
     r_next = np.int64(np.floor(r * factor + 0.5))
@@ -115,51 +120,54 @@ def _step(sums, r, rule):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _find_radius(blocks, observable, block, local, view, least, rule, votes, shells, sums):  # type: ignore[no-untyped-def]
+def _find_radius(halo, margin, x, y, z, seen, rule, scratch):  # type: ignore[no-untyped-def]
     """Follow the radius until it repeats; of a cycle the smallest. (radius, reach, votes): reach is
-    the largest radius that was looked at, and so far `votes` are listed."""
+    the largest radius that was looked at, and so far `votes` are listed; radius 0 where it would
+    leave the halo."""
+    lists, votes, sums = scratch
     r = rule.start
     reach = r
-    count = collect(blocks, observable, block, local, r, view, least, votes, shells)
+    count = take(halo, margin, x, y, z, r, MOST, seen >> 32 != 0, lists)
+    decode(lists, count, seen, x + margin, y + margin, z + margin, votes)
     visited = np.int64(0)
     while True:
-        within(shells, r, sums)
+        within(votes, count, r, sums)
         visited |= np.int64(1) << r
         r_next = _step(sums, r, rule)
         if r_next == r or (visited >> r_next) & 1:
+            if r_next < r:
+                within(votes, count, r_next, sums)
             return min(r, r_next), reach, count
         r = r_next
+        if r > margin:
+            return 0, reach, count
         if r > reach:
             reach = r
-            count = collect(blocks, observable, block, local, r, view, least, votes, shells)
+            count = take(halo, margin, x, y, z, r, MOST, seen >> 32 != 0, lists)
+            decode(lists, count, seen, x + margin, y + margin, z + margin, votes)
 
 
 @njit(cache=True, nogil=True)
-def _estimate(blocks, observable, block, local, rule, votes, shells, sums):  # type: ignore[no-untyped-def]
-    """(class, nx, ny, nz, gamma in half degrees, at a border, reach) of one voxel."""
-    seen = observable[blocks.rows[block, local]]
+def _estimate(halo, margin, local, seen, rule, scratch):  # type: ignore[no-untyped-def]
+    """(class, nx, ny, nz, gamma in half degrees, at a border, reach) of a voxel of the block that
+    `halo` surrounds; class WIDER where the halo is too narrow to tell."""
+    lists, votes, sums = scratch
     if seen == 0:
         return EMPTY, 0, 0, 0, 0, False, 0
-    view = (
-        float(((seen >> 16) & 31) - 8),
-        float(((seen >> 21) & 31) - 8),
-        float(((seen >> 26) & 31) - 8),
-    )
-    least = -0.5 * np.sqrt(view[0] * view[0] + view[1] * view[1] + view[2] * view[2])  # cos 120 deg
-    mixed = ((seen >> 31) & 1) == 1
-    if mixed:  # seen from opposite directions: any side may vote until a normal is known
-        least = -np.inf
-    r, reach, count = _find_radius(
-        blocks, observable, block, local, view, least, rule, votes, shells, sums
-    )
-    within(shells, r, sums)
+    x, y, z = local & 7, (local >> 3) & 7, local >> 6
+    r, reach, count = _find_radius(halo, margin, x, y, z, seen, rule, scratch)
+    if r == 0:
+        return WIDER, 0, 0, 0, 0, False, 0
     if sums[0] < rule.sparse:
         return SPARSE, 0, 0, 0, 0, False, reach
-    kind, nx, ny, nz, tan_gamma = _classify(sums, seen, rule)
+    one_pose = seen >> 32 != 0 and is_one_pose(lists, votes, count, r)
+    kind, nx, ny, nz, tan_gamma = _classify(sums, seen, one_pose, rule)
     if kind == THICK and tan_gamma <= rule.tan_theta:  # beside a plane, not on it: a noise shell
         return kind, 0, 0, 0, 255, False, reach
     cx, cy, cz = seen & 15, (seen >> 4) & 15, (seen >> 8) & 15
-    first = r  # the region that gives the first normal: smaller where the full one is thick
+    first = (
+        r  # radius of the region that gives the first normal: smaller where the full one is thick
+    )
     while kind != ALIGNED:
         passes = 1 if kind == VALID else rule.passes
         for _ in range(passes):  # look again: its own side, by the normal, and its own slab
@@ -167,16 +175,16 @@ def _estimate(blocks, observable, block, local, rule, votes, shells, sums):  # t
             within_slab(votes, count, r, nx, ny, nz, own, rule.slab, sums)
             if sums[0] < rule.sparse:
                 return SPARSE, 0, 0, 0, 0, False, reach
-            kind, nx, ny, nz, tan_gamma = _classify(sums, seen, rule)
+            kind, nx, ny, nz, tan_gamma = _classify(sums, seen, one_pose, rule)
         first -= 1
         if kind == VALID or first < max(1, r - rule.shrink):
             break
-        within(shells, first, sums)
+        within(votes, count, first, sums)
         if sums[0] < rule.least_first:
             break
-        _, nx, ny, nz, _ = _classify(sums, seen, rule)
+        _, nx, ny, nz, _ = _classify(sums, seen, one_pose, rule)
         kind = THICK
-    if mixed and kind == VALID and nx * view[0] + ny * view[1] + nz * view[2] < 4.0:
+    if kind == VALID and (seen >> 31) & 1 == 1 and _towards(seen, nx, ny, nz) < 4.0:
         kind = MIXED  # both sides of a thin thing, not one side from two directions
     half_degrees = np.int64(np.floor(np.arctan(tan_gamma) * 114.59155902616465 + 0.5))
     return (
@@ -202,51 +210,44 @@ def _at_border(sums, seen, r, nx, ny, nz, rule):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _classify(sums, seen, rule):  # type: ignore[no-untyped-def]
+def _towards(seen, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """The normal along the view direction of the voxel with observable `seen`."""
+    return (
+        nx * (((seen >> 16) & 31) - 8)
+        + ny * (((seen >> 21) & 31) - 8)
+        + nz * (((seen >> 26) & 31) - 8)
+    )
+
+
+@njit(cache=True, nogil=True)
+def _classify(sums, seen, one_pose, rule):  # type: ignore[no-untyped-def]
     """(class, normal towards the view, tan gamma) of the voxel with observable `seen`."""
-    cx, cy, cz = seen & 15, (seen >> 4) & 15, (seen >> 8) & 15
-    vx, vy, vz = ((seen >> 16) & 31) - 8, ((seen >> 21) & 31) - 8, ((seen >> 26) & 31) - 8
-    ratio, tan_gamma, v3 = shape(sums, rule.floor2)
     a, b, c, d, e, f = covariance(sums)
-    nx, ny, nz = eigenvector(a, b, c, d, e, f, v3)
-    if nx * vx + ny * vy + nz * vz < 0.0:
+    variances = eigenvalues(a, b, c, d, e, f)
+    ratio, tan_gamma = shape(variances, rule.floor2)
+    nx, ny, nz = eigenvector(a, b, c, d, e, f, variances[2])
+    if _towards(seen, nx, ny, nz) < 0.0:
         nx, ny, nz = -nx, -ny, -nz
-    if ratio < rule.epsilon or sums[11] > 0:
+    if ratio < rule.epsilon or one_pose:
         return ALIGNED, nx, ny, nz, tan_gamma
-    w = float(sums[1])  # the voxel itself must lie on the plane of its region: no noise shells
-    own = nx * (cx - sums[2] / w) + ny * (cy - sums[3] / w) + nz * (cz - sums[4] / w)
+    one = 1.0 / sums[1]  # the voxel itself must lie on the plane of its region: no noise shells
+    own = (
+        nx * ((seen & 15) - sums[2] * one)
+        + ny * (((seen >> 4) & 15) - sums[3] * one)
+        + nz * (((seen >> 8) & 15) - sums[4] * one)
+    )
     if tan_gamma > rule.tan_theta or abs(own) > rule.offset:
         return THICK, nx, ny, nz, tan_gamma
     return VALID, nx, ny, nz, tan_gamma
 
 
-@njit(cache=True, nogil=True, parallel=True)
-def _estimate_rows(blocks, columns, normals, rows, rule, changed):  # type: ignore[no-untyped-def]
-    """Estimate rows (S,), write what they derive to, and mark those whose derived values changed.
-
-    Every row depends on observables alone and writes its own place: threads change nothing."""
-    chunks = (rows.shape[0] + CHUNK - 1) // CHUNK
-    for chunk in prange(chunks):
-        votes = np.empty((MOST, COLUMNS))
-        shells = np.zeros((rule.largest + 1, SUMS), np.int64)
-        sums = np.zeros(SUMS, np.int64)
-        for s in range(chunk * CHUNK, min(rows.shape[0], (chunk + 1) * CHUNK)):
-            changed[s] = _estimate_row(blocks, columns, normals, rows[s], rule, votes, shells, sums)
-
-
 @njit(cache=True, nogil=True)
-def _estimate_row(blocks, columns, normals, row, rule, votes, shells, sums):  # type: ignore[no-untyped-def]
-    """Estimate one row and write it. Whether anything changed."""
-    kind, nx, ny, nz, gamma, border, reach = _estimate(
-        blocks,
-        columns.observable,
-        columns.block[row],
-        columns.local[row],
-        rule,
-        votes,
-        shells,
-        sums,
-    )
+def _estimate_row(halo, margin, observable, normals, row, local, rule, scratch):  # type: ignore[no-untyped-def]
+    """Estimate one row and write it. SAME, CHANGED, or WIDER where nothing was written."""
+    seen = observable[row]
+    kind, nx, ny, nz, gamma, border, reach = _estimate(halo, margin, local, seen, rule, scratch)
+    if kind == WIDER:
+        return WIDER
     unit = normals.unit[row]
     changed = (
         normals.kind[row] != kind
@@ -261,16 +262,71 @@ def _estimate_row(blocks, columns, normals, row, rule, votes, shells, sums):  # 
     normals.border[row] = border
     normals.reach[row] = reach
     unit[0], unit[1], unit[2] = nx, ny, nz
-    return changed
+    return CHANGED if changed else SAME
 
 
-def estimate(
-    store: VoxelStore, normals: Normals, rows: NDArray[np.int32], rule: Rule
-) -> NDArray[np.bool_]:
-    """Estimate the normals of `rows` (S,) in place. Returns (S,) whether each of them changed."""
-    changed = np.empty(len(rows), np.bool_)
-    _estimate_rows(store.blocks, store.columns, normals, rows, rule, changed)
-    return changed
+@njit(cache=True, nogil=True)
+def _estimate_block(blocks, observable, normals, block, stale, rule, halo, scratch):  # type: ignore[no-untyped-def]
+    """Estimate the voxels of a block whose bit is set in stale (8,), which comes back clear.
+    Whether any changed. Few need to look far: the wider halos are gathered for them alone."""
+    turned = False
+    for margin in (min(NARROW, rule.largest), min(WIDE, rule.largest), rule.largest):
+        left = np.uint64(0)
+        gather(blocks, observable, block, margin, halo)
+        for z in range(8):
+            word = stale[z]
+            while word != np.uint64(0):
+                bit = np.int64(trailing_zeros(word))
+                word &= word - np.uint64(1)
+                local = 64 * z + bit
+                row = blocks.rows[block, local]
+                became = _estimate_row(halo, margin, observable, normals, row, local, rule, scratch)
+                if became != WIDER:
+                    stale[z] &= ~(np.uint64(1) << np.uint64(bit))
+                    turned |= became == CHANGED
+            left |= stale[z]
+        if left == np.uint64(0):
+            break
+    return turned
+
+
+@njit(cache=True, nogil=True)
+def _deepest(blocks, reach, block):  # type: ignore[no-untyped-def]
+    """The largest reach of a block's voxels."""
+    largest = np.uint8(0)
+    for local in range(512):
+        row = blocks.rows[block, local]
+        if row >= 0:
+            largest = max(largest, reach[row])
+    return largest
+
+
+@njit(cache=True, nogil=True, parallel=True)
+def _refresh(blocks, columns, normals, deepest, dirty, which, rule, halos, counts, turned):  # type: ignore[no-untyped-def]
+    """Estimate again what is stale in the blocks `which` (C,); counts (C,) says how many voxels,
+    turned (C,) whether any of them changed.
+
+    Every voxel depends on observables alone and writes its own place: threads change nothing."""
+    for share in prange(halos.rows.shape[0]):
+        halo = Halo(halos.listed[share], halos.rows[share], halos.first[share], halos.near[share])
+        scratch = (
+            np.empty((LISTS, MOST + 16), np.int32),  # 16: columns start on different cache sets
+            np.empty((COLUMNS, MOST + 16), np.int32),
+            np.zeros(SUMS, np.int64),
+        )
+        stale = np.zeros(8, np.uint64)
+        for q in range(share, which.shape[0], halos.rows.shape[0]):
+            block = which[q]
+            counts[q] = find_stale(
+                blocks, dirty, normals.reach, block, deepest[1 + block], rule.start,
+                halo.near, halo.rows, stale,
+            )  # fmt: skip
+            turned[q] = False
+            if counts[q] > 0:
+                turned[q] = _estimate_block(
+                    blocks, columns.observable, normals, block, stale, rule, halo, scratch
+                )
+                deepest[1 + block] = _deepest(blocks, normals.reach, block)
 
 
 class NormalField:
@@ -285,52 +341,48 @@ class NormalField:
             np.zeros(0, np.bool_),
             np.zeros(0, np.uint8),
         )
+        self._deepest = np.zeros(1, np.uint8)  # largest reach of all, then by block
+        self._dirty = np.zeros((0, 8), np.uint64)
         self._flags = np.zeros(0, np.bool_)
-        self._deepest = np.zeros(2, np.int32)  # [unused, largest of all, by block ...]
-        self._dirty_mask = np.zeros((0, 8), np.uint64)
-        self._block_flags = np.zeros(0, np.bool_)
+        self._halos = make_halos(SHARES)
 
-    def update(
-        self, store: VoxelStore, dirty: NDArray[np.int32]
-    ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
+    def update(self, store: VoxelStore, dirty: NDArray[np.int32]) -> tuple[int, NDArray[np.int32]]:
         """Re-estimate what `dirty` rows (D,) made stale.
 
-        Returns (stale rows (S,), rows whose derived values changed (C,))."""
+        Returns (number of stale voxels, blocks in which a derived value changed)."""
         self._fit(store)
-        stale = self.stale(store, dirty)
-        changed = estimate(store, self.normals, stale, self._rule)
-        deepen(store.blocks, store.columns, stale, self.normals.reach, self._deepest)
-        return stale, stale[changed]
-
-    def stale(self, store: VoxelStore, dirty: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Rows (S,) whose region, as far as it was looked at, holds a dirty voxel."""
-        out_blocks = np.empty(len(dirty), np.int32)
-        count = mark_dirty(store.columns, dirty, self._dirty_mask, self._block_flags, out_blocks)
-        dirty_blocks = out_blocks[:count]
-        out = np.empty(store.num_rows, np.int32)
-        num = find_stale(
-            store.blocks, store.columns, self.normals.reach, self._deepest, dirty,
-            self._dirty_mask, dirty_blocks, self._flags, out,
+        near = np.empty(store.num_blocks, np.int32)
+        sources = near[: mark_dirty(store.columns, dirty, self._dirty, self._flags, near)].copy()
+        which = self._candidates(store, sources)
+        counts, turned = np.empty(len(which), np.int32), np.empty(len(which), np.bool_)
+        _refresh(
+            store.blocks, store.columns, self.normals, self._deepest, self._dirty, which,
+            self._rule, self._halos, counts, turned,
         )  # fmt: skip
-        self._dirty_mask[dirty_blocks] = 0
-        return out[:num].copy()
+        self._dirty[sources] = 0
+        self._deepest[0] = self._deepest[1:].max(initial=0)
+        return int(counts.sum()), which[turned]
+
+    def _candidates(self, store: VoxelStore, sources: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Blocks (C,) that may hold stale voxels, those with dirty ones being `sources`."""
+        near = np.empty(store.num_blocks, np.int32)
+        return near[: find_candidates(store.blocks, self._deepest, sources, self._flags, near)]
 
     def _fit(self, store: VoxelStore) -> None:
         rows, blocks = len(store.columns.block), len(store.blocks.keys)
-        if len(self._flags) < rows:
-            more = rows - len(self._flags)
+        if len(self.normals.kind) < rows:
+            more = rows - len(self.normals.kind)
             self.normals = Normals(
                 *(
                     np.concatenate([c, np.zeros((more, *c.shape[1:]), c.dtype)])
                     for c in self.normals
                 )
             )
-            self._flags = np.zeros(rows, np.bool_)
-        if len(self._dirty_mask) < blocks:
-            more = blocks - len(self._dirty_mask)
-            self._deepest = np.concatenate([self._deepest, np.zeros(more, np.int32)])
-            self._dirty_mask = np.zeros((blocks, 8), np.uint64)
-            self._block_flags = np.zeros(blocks, np.bool_)
+        if len(self._dirty) < blocks:
+            more = blocks - len(self._dirty)
+            self._deepest = np.concatenate([self._deepest, np.zeros(more, np.uint8)])
+            self._dirty = np.zeros((blocks, 8), np.uint64)
+            self._flags = np.zeros(blocks, np.bool_)
 
 
-__all__ = ["CLASS_NAMES", "NormalField", "Normals", "Rule", "estimate", "make_rule"]
+__all__ = ["CLASS_NAMES", "NormalField", "Normals", "Rule", "make_rule"]

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 
 from facet.mapping.bits import trailing_zeros
 from facet.mapping.blocks import CENTRE
-from facet.mapping.claims import REACH_BLOCKS, label_blocks
+from facet.mapping.claims import label_blocks
 from facet.mapping.eigen import smallest
 from facet.mapping.normals import VALID, Normals
-from facet.mapping.settings import STEPS, TICKS, MapSettings
-from facet.mapping.store import MOMENTS, VoxelStore
+from facet.mapping.settings import STEPS, MapSettings
+from facet.mapping.store import MOMENTS, VoxelStore, shift_moments
 
 PER_BLOCK = 12  # patches of a block; what finds no place is a leftover
 RUNGS = 40
@@ -42,6 +42,7 @@ class Patches(NamedTuple):
     total: NDArray[np.int64]  # points of all members
     rung: NDArray[np.int8]  # of sigma_N
     counted: NDArray[np.int32]  # votes that stand in the histogram of rungs
+    far: NDArray[np.bool_]  # (B,) the block's labels depend on patches two blocks away, not one
     member: NDArray[np.int8]  # (V,) index of the patch that a valid voxel belongs to, -1: none
     label: NDArray[np.int16]  # (V,) 16 * neighbour + index: the patch that a voxel goes with
     second: NDArray[np.int16]  # (V,) another patch, at an angle, that claims a corner voxel
@@ -68,6 +69,7 @@ def empty_patches() -> Patches:
         total=np.zeros(shape, np.int64),
         rung=np.zeros(shape, np.int8),
         counted=np.zeros(shape, np.int32),
+        far=np.zeros(0, np.bool_),
         member=np.zeros(0, np.int8),
         label=np.zeros(0, np.int16),
         second=np.zeros(0, np.int16),
@@ -203,10 +205,12 @@ def _group_blocks(blocks, observable, normals, patches, which, grouping, changed
 
 
 @njit(cache=True, nogil=True)
-def _add_points(blocks, moments, border, patches, block, pure, m):  # type: ignore[no-untyped-def]
+def _add_points(blocks, moments, border, patches, block, pure, m, total):  # type: ignore[no-untyped-def]
     """Sum the members' point moments about the block corner into m (PER_BLOCK, 10): of all, or
-    only of `pure` ones: not at a border, and claimed by no plane at an angle."""
+    only of `pure` ones: not at a border, and claimed by no plane at an angle. Count the points of
+    all members in total (PER_BLOCK,)."""
     m[:] = 0
+    total[:] = 0
     for z in range(8):
         word = blocks.occupied[block, z]
         while word != np.uint64(0):
@@ -214,20 +218,12 @@ def _add_points(blocks, moments, border, patches, block, pure, m):  # type: igno
             word &= word - np.uint64(1)
             row = blocks.rows[block, 64 * z + bit]
             own_label = patches.label[row]
-            p = own_label & 15 if own_label >> 4 == CENTRE else -1
-            if p < 0 or (pure and (border[row] or patches.second[row] >= 0)):
+            if own_label >> 4 != CENTRE:
                 continue
-            own = moments[row]
-            n = own[0]
-            d = (TICKS * (bit & 7), TICKS * (bit >> 3), TICKS * z)
-            s = 4
-            for a in range(3):
-                for b in range(a, 3):
-                    m[p, s] += own[s] + d[a] * own[1 + b] + d[b] * own[1 + a] + n * d[a] * d[b]
-                    s += 1
-            for a in range(3):
-                m[p, 1 + a] += own[1 + a] + n * d[a]
-            m[p, 0] += n
+            p = own_label & 15
+            total[p] += moments[row, 0]
+            if not (pure and (border[row] or patches.second[row] >= 0)):
+                shift_moments(moments[row], bit & 7, bit >> 3, z, m[p])
 
 
 @njit(cache=True, nogil=True)
@@ -247,22 +243,25 @@ def _variance(m):  # type: ignore[no-untyped-def]
 def _sum_points(blocks, moments, border, patches, which, rungs, histogram):  # type: ignore[no-untyped-def]
     """Point moments and the rung of sigma_N. Corner voxels hold points of two planes: they are
     left out where enough others are there."""
-    whole = np.zeros((PER_BLOCK, MOMENTS), np.int64)
-    pure = np.zeros((PER_BLOCK, MOMENTS), np.int64)
+    pure = np.empty((PER_BLOCK, MOMENTS), np.int64)
+    whole = np.empty((PER_BLOCK, MOMENTS), np.int64)
+    total = np.empty(PER_BLOCK, np.int64)
     for q in range(which.shape[0]):
         block = which[q]
-        _add_points(blocks, moments, border, patches, block, False, whole)
-        _add_points(blocks, moments, border, patches, block, True, pure)
+        _add_points(blocks, moments, border, patches, block, True, pure, total)
+        count = np.int64(patches.number[block])
+        if np.any(PURE_SHARE * pure[:count, 0] < total[:count]):
+            _add_points(blocks, moments, border, patches, block, False, whole, total)
         for p in range(PER_BLOCK):
             votes = patches.counted[block, p]
             if votes > 0:
                 histogram[patches.rung[block, p]] -= votes
             patches.counted[block, p] = 0
-            if p >= patches.number[block]:
+            if p >= count:
                 continue
             patches.points[block, p] = pure[p]
-            patches.total[block, p] = whole[p, 0]
-            variance = _variance(pure[p] if PURE_SHARE * pure[p, 0] >= whole[p, 0] else whole[p])
+            patches.total[block, p] = total[p]
+            variance = _variance(pure[p] if PURE_SHARE * pure[p, 0] >= total[p] else whole[p])
             rung = 0
             while rung < RUNGS - 1 and variance > rungs[rung]:
                 rung += 1
@@ -305,38 +304,27 @@ class PatchField:
         self,
         store: VoxelStore,
         normals: Normals,
-        changed_rows: NDArray[np.int32],
+        dirty: NDArray[np.int32],
         touched_rows: NDArray[np.int32],
     ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
-        """Group the blocks of `changed_rows` again (normals or observables changed) and sum the
-        points of the blocks of `touched_rows`.
+        """Group the blocks `dirty` again (normals or observables changed) and sum the points of
+        the blocks of `touched_rows`.
 
         Returns blocks: (patches changed), (labels changed), (point moments changed)."""
         self._fit(store)
         block_of = store.columns.block
-        dirty = np.unique(block_of[changed_rows])
         changed = np.empty(len(dirty), np.bool_)
         _group_blocks(
             store.blocks, store.columns.observable, normals, self.patches, dirty,
             self._grouping, changed,
         )  # fmt: skip
         regrouped = dirty[changed]
-        near = np.empty(store.num_blocks, np.int32)
-        count = _dilate(store.blocks, regrouped, self._flags, near)
-        for _ in range(REACH_BLOCKS - 1):
-            wider = np.empty(store.num_blocks, np.int32)
-            more = _dilate(store.blocks, near[:count], self._flags, wider)
-            near, count = wider, more
-        near = np.union1d(near[:count], dirty)
+        near = np.union1d(self._around(store, regrouped), dirty)
         relabelled = np.zeros(len(near), np.bool_)
         label_blocks(
-            store.blocks,
-            store.columns.observable,
-            self.patches,
-            near,
-            self._grouping.leftover,
+            store.blocks, store.columns.observable, self.patches, near, self._grouping.leftover,
             relabelled,
-        )
+        )  # fmt: skip
         relabelled_blocks = near[relabelled]
         touched = np.union1d(block_of[touched_rows], np.union1d(dirty, relabelled_blocks))
         _sum_points(
@@ -349,6 +337,13 @@ class PatchField:
             self.histogram,
         )
         return regrouped, relabelled_blocks, touched
+
+    def _around(self, store: VoxelStore, blocks: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Blocks whose labels depend on the patches of `blocks`."""
+        near, wide = (np.empty(store.num_blocks, np.int32) for _ in range(2))
+        near = near[: _dilate(store.blocks, blocks, self._flags, near)]
+        wide = wide[: _dilate(store.blocks, near, self._flags, wide)]
+        return np.union1d(near, wide[self.patches.far[wide]])
 
     def sigma(self) -> float:
         """Noise of the scene, ticks: the median over member voxels of their patch's rung."""

@@ -22,6 +22,7 @@ CELLS = 64  # cells of a (u, v) tile's edge; a cell is one voxel, 8 x 8 grid poi
 HALO = 11  # cells: a point within 2 alpha is at most so far away
 SIDE = CELLS + 2 * HALO  # cells of a window's edge: a tile with its halo
 SPAN = math.isqrt(4 * ALPHA2)  # largest coordinate difference within 2 alpha
+FEW = 16  # tiles that are not worth waking other threads for
 _FULL = 2.0 * math.pi
 
 
@@ -92,16 +93,44 @@ def _surrounded(window, row, column):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _roll(window, begin, length, around, edges):  # type: ignore[no-untyped-def]
-    """Edges (u, v, u', v') that start in the window's middle tile, grid units from the tile's
-    corner. Returns how many, or -1 where `edges` is too short."""
+def mark_changes(old, new, near):  # type: ignore[no-untyped-def]
+    """Mark in near (SIDE, SIDE) the cells, of a tile and of its halo, whose points may have other
+    edges now that the tile's cells are `new`, not `old`. Whether there are any.
+
+    What a cell holds matters to nobody while all its neighbours hold points, before and after: a
+    disc that touches it swallows one of them whole, so it is not empty either way."""
+    rows = np.zeros((CELLS, SIDE), np.bool_)
+    found = False
+    for row in range(CELLS):
+        for column in range(CELLS):
+            if old[row, column] == new[row, column]:
+                continue
+            inside = 0 < row < CELLS - 1 and 0 < column < CELLS - 1
+            if inside and _surrounded(old, row, column) and _surrounded(new, row, column):
+                continue
+            rows[row, column : column + 2 * HALO + 1] = True
+            found = True
+    if found:
+        for row in range(CELLS):
+            if rows[row].any():
+                for k in range(row, row + 2 * HALO + 1):
+                    near[k] |= rows[row]
+    return found
+
+
+@njit(cache=True, nogil=True)
+def _roll(window, wanted, begin, length, around, edges):  # type: ignore[no-untyped-def]
+    """Edges (u, v, u', v') that start in the wanted cells (CELLS, CELLS) of the window's middle
+    tile, grid units from the tile's corner. Returns how many, or -1 where `edges` is too short."""
     gaps = np.empty((64, 2))
     ends = np.empty((64, 2), np.int64)
     num = 0
     for row in range(CELLS):
         for column in range(CELLS):
             word = window[row + HALO, column + HALO]
-            if word == np.uint64(0) or _surrounded(window, row + HALO, column + HALO):
+            if word == np.uint64(0) or not wanted[row, column]:
+                continue
+            if _surrounded(window, row + HALO, column + HALO):
                 continue
             while word != np.uint64(0):
                 bit = np.int64(trailing_zeros(word))
@@ -139,20 +168,30 @@ def _roll(window, begin, length, around, edges):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, parallel=True)
-def _roll_all(windows, begin, length, around, edges, counts):  # type: ignore[no-untyped-def]
+def _roll_all(windows, wanted, begin, length, around, edges, counts):  # type: ignore[no-untyped-def]
     for n in prange(windows.shape[0]):
-        counts[n] = _roll(windows[n], begin, length, around, edges[n])
+        counts[n] = _roll(windows[n], wanted[n], begin, length, around, edges[n])
 
 
-def boundary_edges(windows: NDArray[np.uint64]) -> list[NDArray[np.int32]]:
-    """For each window (N, ..) of cells its edges (E, 4): (u, v, u', v') that start in the middle.
+def boundary_edges(
+    windows: NDArray[np.uint64], wanted: NDArray[np.bool_] | None = None
+) -> list[NDArray[np.int32]]:
+    """For each window (N, ..) of cells its edges (E, 4): (u, v, u', v') that start in the wanted
+    cells of the middle; all of them by default.
 
-    windows: (N, SIDE, SIDE) words, a bit u + 8 v for each grid point of a cell, rows by v."""
+    windows: (N, SIDE, SIDE) words, a bit u + 8 v for each grid point of a cell, rows by v; wanted:
+    (N, CELLS, CELLS)."""
+    if wanted is None:
+        wanted = np.ones((len(windows), CELLS, CELLS), np.bool_)
     room = 1024
     while True:
         edges = np.empty((len(windows), room, 4), np.int32)
         counts = np.empty(len(windows), np.int64)
-        _roll_all(windows, _BEGIN, _LENGTH, _AROUND, edges, counts)
+        if len(windows) < FEW:
+            for n in range(len(windows)):
+                counts[n] = _roll(windows[n], wanted[n], _BEGIN, _LENGTH, _AROUND, edges[n])
+        else:
+            _roll_all(windows, wanted, _BEGIN, _LENGTH, _AROUND, edges, counts)
         if not (counts < 0).any():
             return [own[:count].copy() for own, count in zip(edges, counts, strict=True)]
         room *= 4

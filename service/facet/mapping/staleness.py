@@ -5,94 +5,97 @@ from __future__ import annotations
 import numpy as np
 from numba import njit
 
-from facet.mapping.bits import box_mask, trailing_zeros
+from facet.mapping.bits import population, trailing_zeros
 from facet.mapping.blocks import find, pack, unpack
+from facet.mapping.halo import SIDE_BLOCKS, fill_rows, find_near
+from facet.mapping.settings import BLOCK
 
 
 @njit(cache=True, nogil=True)
-def find_stale(blocks, columns, reach, deepest, dirty_rows, dirty_mask, dirty_blocks, flags, out):  # type: ignore[no-untyped-def]
-    """Rows whose region, as far as they looked, holds a dirty voxel. dirty_mask (B, 8) has a bit
-    per dirty voxel; flags (V,) is scratch and comes back clear. Returns how many."""
-    count = 0
-    for d in range(dirty_rows.shape[0]):  # a dirty voxel is stale itself
-        row = dirty_rows[d]
-        flags[row] = True
-        out[count] = row
-        count += 1
-    for q in range(dirty_blocks.shape[0]):
-        source = dirty_blocks[q]
-        bi, bj, bk = unpack(blocks.keys[source])
-        for n in range(343):
-            di, dj, dk = n % 7 - 3, (n // 7) % 7 - 3, n // 49 - 3
-            gap = max(0, 8 * max(abs(di), abs(dj), abs(dk)) - 7)
-            if gap <= 8:
-                if di == 0 and dj == 0 and dk == 0:
-                    target = source
-                else:
-                    target = blocks.neighbours[source, (di + 1) + 3 * (dj + 1) + 9 * (dk + 1)]
-            else:
-                if gap > deepest[1]:
-                    continue
-                key = pack(bi + di, bj + dj, bk + dk)
-                target = find(blocks.table_keys, blocks.table_values, key)
-            if target < 0 or deepest[2 + target] < gap:
-                continue
-            for tz in range(8):
-                word = blocks.occupied[target, tz]
-                while word != np.uint64(0):
-                    bit = np.int64(trailing_zeros(word))
-                    word &= word - np.uint64(1)
-                    row = blocks.rows[target, 64 * tz + bit]
-                    if flags[row]:
-                        continue
-                    r = np.int64(reach[row])
-                    x = (bit & 7) + 8 * di
-                    y = (bit >> 3) + 8 * dj
-                    z = tz + 8 * dk
-                    x0, x1, y0, y1 = max(0, x - r), min(7, x + r), max(0, y - r), min(7, y + r)
-                    if x0 > x1 or y0 > y1:
-                        continue
-                    mask = box_mask(x0, x1, y0, y1)
-                    for sz in range(max(0, z - r), min(7, z + r) + 1):
-                        if dirty_mask[source, sz] & mask:
-                            flags[row] = True
-                            out[count] = row
-                            count += 1
-                            break
-    for s in range(count):
-        flags[out[s]] = False
-    return count
-
-
-@njit(cache=True, nogil=True)
-def mark_dirty(columns, rows, dirty_mask, block_flags, out):  # type: ignore[no-untyped-def]
-    """Set the rows' bits in dirty_mask and list their blocks once. Returns how many blocks."""
+def mark_dirty(columns, rows, dirty, flags, out):  # type: ignore[no-untyped-def]
+    """Set the rows' bits in dirty (B, 8) and list their blocks once. Returns how many blocks."""
     count = 0
     for d in range(rows.shape[0]):
         block, local = columns.block[rows[d]], columns.local[rows[d]]
-        dirty_mask[block, local >> 6] |= np.uint64(1) << np.uint64(local & 63)
-        if not block_flags[block]:
-            block_flags[block] = True
+        dirty[block, local >> 6] |= np.uint64(1) << np.uint64(local & 63)
+        if not flags[block]:
+            flags[block] = True
             out[count] = block
             count += 1
     for q in range(count):
-        block_flags[out[q]] = False
+        flags[out[q]] = False
     return count
 
 
 @njit(cache=True, nogil=True)
-def deepen(blocks, columns, rows, reach, deepest):  # type: ignore[no-untyped-def]
-    """Refresh, for the rows' blocks, the largest reach of a block's voxels (deepest[2 + block])."""
-    for s in range(rows.shape[0]):
-        deepest[2 + columns.block[rows[s]]] = 0
-    for s in range(rows.shape[0]):
-        block = columns.block[rows[s]]
-        if deepest[2 + block] > 0:
-            continue
-        largest = 0
-        for local in range(512):
-            row = blocks.rows[block, local]
-            if row >= 0:
-                largest = max(largest, np.int64(reach[row]))
-        deepest[2 + block] = max(1, largest)
-        deepest[1] = max(deepest[1], largest)
+def find_candidates(blocks, deepest, sources, flags, out):  # type: ignore[no-untyped-def]
+    """Blocks that look as far as one of the blocks `sources`, these included. deepest (1 + B,):
+    the largest reach of all, then by block. Returns how many."""
+    count = 0
+    side = 2 * (SIDE_BLOCKS // 2) + 1
+    for s in range(sources.shape[0]):
+        bi, bj, bk = unpack(blocks.keys[sources[s]])
+        for n in range(side * side * side):
+            di = n % side - side // 2
+            dj = (n // side) % side - side // 2
+            dk = n // (side * side) - side // 2
+            gap = BLOCK * max(abs(di), abs(dj), abs(dk)) - BLOCK + 1
+            if gap <= 1:
+                target = np.int64(sources[s])
+                if gap == 1:
+                    place = (di + 1) + 3 * (dj + 1) + 9 * (dk + 1)
+                    target = np.int64(blocks.neighbours[sources[s], place])
+            elif gap > deepest[0]:
+                continue
+            else:
+                key = pack(bi + di, bj + dj, bk + dk)
+                target = np.int64(find(blocks.table_keys, blocks.table_values, key))
+            if target < 0 or flags[target] or (deepest[1 + target] < gap and target != sources[s]):
+                continue
+            flags[target] = True
+            out[count] = target
+            count += 1
+    for q in range(count):
+        flags[out[q]] = False
+    return count
+
+
+@njit(cache=True, nogil=True)
+def find_stale(blocks, dirty, reach, block, deepest, common, near, lines, stale):  # type: ignore[no-untyped-def]
+    """Set in stale (8,) the bits of a block's voxels that look at a dirty one, or are dirty
+    themselves. `common` is the reach that most voxels have. Returns how many."""
+    margin = max(common, deepest)
+    edge = BLOCK + 2 * margin
+    blocks_out = (margin + 7) >> 3
+    find_near(blocks, block, blocks_out, near)
+    fill_rows(dirty, near, blocks_out, margin, lines)
+    count = 0
+    for z in range(8):
+        stale[z] = dirty[block, z]
+        for y in range(8):
+            byte = (blocks.occupied[block, z] >> np.uint64(8 * y)) & np.uint64(255)
+            if byte == np.uint64(0):
+                continue
+            seen = _column(lines, edge, y + margin, z + margin, common)
+            while byte != np.uint64(0):
+                bit = np.int64(trailing_zeros(byte))
+                byte &= byte - np.uint64(1)
+                r = np.int64(reach[blocks.rows[block, 64 * z + 8 * y + bit]])
+                found = seen
+                if r != common:
+                    found = _column(lines, edge, y + margin, z + margin, r)
+                cube = (np.uint64(1) << np.uint64(2 * r + 1)) - np.uint64(1)
+                if (found >> np.uint64(bit + margin - r)) & cube != np.uint64(0):
+                    stale[z] |= np.uint64(1) << np.uint64(8 * y + bit)
+        count += np.int64(population(stale[z]))
+    return count
+
+
+@njit(cache=True, nogil=True)
+def _column(lines, edge, y, z, r):  # type: ignore[no-untyped-def]
+    """All rows within r of the row (y, z), one over the other."""
+    seen = np.uint64(0)
+    for k in range(z - r, z + r + 1):
+        for line in range(k * edge + y - r, k * edge + y + r + 1):
+            seen |= lines[line]
+    return seen

@@ -94,15 +94,32 @@ def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched
 
 
 @njit(cache=True, nogil=True)
+def shift_moments(own, x, y, z, total):  # type: ignore[no-untyped-def]
+    """Add moments (10,) to `total`, about a corner that lies x, y, z voxels before their own."""
+    n, dx, dy, dz = own[0], TICKS * x, TICKS * y, TICKS * z
+    total[0] += n
+    total[1] += own[1] + n * dx
+    total[2] += own[2] + n * dy
+    total[3] += own[3] + n * dz
+    total[4] += own[4] + 2 * dx * own[1] + n * dx * dx
+    total[5] += own[5] + dx * own[2] + dy * own[1] + n * dx * dy
+    total[6] += own[6] + dx * own[3] + dz * own[1] + n * dx * dz
+    total[7] += own[7] + 2 * dy * own[2] + n * dy * dy
+    total[8] += own[8] + dy * own[3] + dz * own[2] + n * dy * dz
+    total[9] += own[9] + 2 * dz * own[3] + n * dz * dz
+
+
+@njit(cache=True, nogil=True)
 def _coarse(component):  # type: ignore[no-untyped-def]
-    """A component of a direction in eighths, finely near zero, where it tells the side, coarsely
-    elsewhere, where it only drifts with the sensor: 0, 1, 2, 4 or 7."""
-    eighths = np.int64(np.floor(abs(component) * 8.0 + 0.5))
-    if eighths >= 6:
+    """A component of a direction, in eighths: 1, 4 or 7 with its sign. The sign is what tells the
+    side of a surface; the rest mostly drifts with the sensor."""
+    size = abs(component)
+    eighths = np.int64(1)
+    if size >= 0.6875:
         eighths = np.int64(7)
-    elif eighths >= 3:
+    elif size >= 0.3125:
         eighths = np.int64(4)
-    return eighths if component > 0.0 else -eighths
+    return eighths if component >= 0.0 else -eighths
 
 
 @njit(cache=True, nogil=True)

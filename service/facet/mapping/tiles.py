@@ -17,8 +17,8 @@ from facet.mapping.membership import collect, inherit, shell
 from facet.mapping.merging import Limits, Nodes, merge_nodes
 from facet.mapping.normals import UNIT
 from facet.mapping.patches import PER_BLOCK, PatchField
-from facet.mapping.settings import BLOCK, STEPS, TICKS
-from facet.mapping.store import MOMENTS, VoxelStore
+from facet.mapping.settings import BLOCK, STEPS, TILE
+from facet.mapping.store import MOMENTS, VoxelStore, shift_moments
 
 SIDE = 8  # blocks per tile edge
 
@@ -34,7 +34,7 @@ class Tile:
     total: NDArray[np.int64]  # (T,) points of all members
     occupation: NDArray[np.int64]  # (T,) voxels, leftovers included
     rows: NDArray[np.int32]  # (M,) voxel rows of its tile-planes
-    owner: NDArray[np.int16]  # (M,) their tile-plane
+    owner: NDArray[np.int16]  # (M,) their tile-plane, ascending
     corner: NDArray[np.bool_]  # (M,) only a claim on a corner voxel that belongs elsewhere
     pairs: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 3), np.int64))
     # pairs: (own tile-plane, key of the other tile, its tile-plane), adjacent
@@ -45,6 +45,11 @@ class Tile:
     @property
     def num_planes(self) -> int:
         return len(self.nodes.votes)
+
+    def rows_of(self, plane: int) -> NDArray[np.int32]:
+        """Voxel rows of one of its tile-planes, a view."""
+        low, high = np.searchsorted(self.owner, [plane, plane + 1])
+        return self.rows[low:high]
 
 
 @njit(cache=True, nogil=True)
@@ -116,21 +121,11 @@ def _gather_points(block_keys, patches, which, tile_key, plane_of_patch, count):
     for q in range(which.shape[0]):
         block = which[q]
         i, j, k = unpack(block_keys[block])
-        step = TICKS * BLOCK
-        d = (step * (i - 8 * ti), step * (j - 8 * tj), step * (k - 8 * tk))
+        x, y, z = BLOCK * i - TILE * ti, BLOCK * j - TILE * tj, BLOCK * k - TILE * tk
         for p in range(patches.number[block]):
-            m = out[plane_of_patch[block, p]]
-            total[plane_of_patch[block, p]] += patches.total[block, p]
-            own = patches.points[block, p]
-            n = own[0]
-            s = 4
-            for a in range(3):
-                for b in range(a, 3):
-                    m[s] += own[s] + d[a] * own[1 + b] + d[b] * own[1 + a] + n * d[a] * d[b]
-                    s += 1
-            for a in range(3):
-                m[1 + a] += own[1 + a] + n * d[a]
-            m[0] += n
+            plane = plane_of_patch[block, p]
+            total[plane] += patches.total[block, p]
+            shift_moments(patches.points[block, p], x, y, z, out[plane])
     return out, total
 
 
@@ -185,9 +180,9 @@ def spread(tile_keys: NDArray[np.int64], block_keys: NDArray[np.int64]) -> NDArr
     if not len(block_keys):
         return tile_keys
     ijk = unpack_all(block_keys)
-    offsets = np.stack(np.meshgrid(*[[-1, 0, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
-    near = np.unique((ijk[:, None, :] + offsets).reshape(-1, 3) >> 3, axis=0)
-    return np.union1d(tile_keys, pack_all(near))
+    corners = np.stack(np.meshgrid(*[[-1, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
+    near = pack_all((ijk[:, None, :] + corners).reshape(-1, 3) >> 3)  # a tile is 8 blocks wide
+    return np.union1d(tile_keys, near)
 
 
 class TileField:
@@ -302,7 +297,8 @@ class TileField:
         if len(self._scratch) < len(store.columns.block):
             self._scratch = np.zeros(len(store.columns.block), np.int16)
         counts = np.zeros((len(tile.ids), tile.num_planes), np.int64)
-        new = rows[:count].copy(), owner[:count].copy(), corner[:count].copy()
+        order = np.argsort(owner[:count], kind="stable")
+        new = rows[order], owner[order], corner[order]
         inherit(tile.rows, tile.owner, tile.corner, *new, self._scratch, counts)
         old, own = np.nonzero(counts)
         tile.heritage = np.stack([tile.ids[old], own, counts[old, own]], axis=1)

@@ -1,0 +1,145 @@
+"""A block of voxels and its surroundings, gathered once for all regions that start in the block.
+
+The surroundings are kept as rows along x, one for each (y, z): a bit mask of the occupied voxels
+and where in the gathered list the row starts. What a cubic region holds is then a handful of short
+runs of that list.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from facet.mapping.bits import population, trailing_zeros
+from facet.mapping.blocks import find, pack, unpack
+from facet.mapping.settings import BLOCK
+
+WIDEST = 20  # voxels that a halo may reach beyond its block on each side
+EDGE = BLOCK + 2 * WIDEST
+LISTS = 3  # what is listed of a voxel: low and high half of its observable, packed place
+SIDE_BLOCKS = 7  # blocks along an edge of the widest halo
+
+
+class Halo(NamedTuple):
+    """Scratch of one thread: the surroundings of one block at a time."""
+
+    listed: NDArray[np.int32]  # (LISTS, EDGE^3) the occupied voxels, x fastest
+    rows: NDArray[np.uint64]  # (EDGE^2,) a bit per x of the row (z, y), y fastest
+    first: NDArray[np.int32]  # (EDGE^2,) where the row starts in the list
+    near: NDArray[np.int32]  # (SIDE_BLOCKS^3,) blocks, -1: none
+
+
+def make_halos(count: int) -> Halo:
+    """Scratch for `count` threads, stacked: 1.4 MB each, of which only what is used gets memory."""
+    return Halo(
+        np.empty((count, LISTS, EDGE**3), np.int32),
+        np.empty((count, EDGE**2), np.uint64),
+        np.empty((count, EDGE**2), np.int32),
+        np.empty((count, SIDE_BLOCKS**3), np.int32),
+    )
+
+
+@njit(cache=True, nogil=True)
+def find_near(blocks, block, blocks_out, near):  # type: ignore[no-untyped-def]
+    """Number the blocks up to `blocks_out` away into near, x fastest; -1: none."""
+    bi, bj, bk = unpack(blocks.keys[block])
+    n = 0
+    for dk in range(-blocks_out, blocks_out + 1):
+        for dj in range(-blocks_out, blocks_out + 1):
+            for di in range(-blocks_out, blocks_out + 1):
+                if di == 0 and dj == 0 and dk == 0:
+                    near[n] = block
+                elif -1 <= di <= 1 and -1 <= dj <= 1 and -1 <= dk <= 1:
+                    near[n] = blocks.neighbours[block, (di + 1) + 3 * (dj + 1) + 9 * (dk + 1)]
+                else:
+                    key = pack(bi + di, bj + dj, bk + dk)
+                    near[n] = find(blocks.table_keys, blocks.table_values, key)
+                n += 1
+
+
+@njit(cache=True, nogil=True)
+def fill_rows(masks, near, blocks_out, margin, rows):  # type: ignore[no-untyped-def]
+    """Bits of masks (B, 8), voxels up to `margin` beyond the middle one of the blocks `near`, as
+    rows along x: bit 0 lies at x = -margin."""
+    width = 2 * blocks_out + 1
+    edge = BLOCK + 2 * margin
+    all_bits = (np.uint64(1) << np.uint64(edge)) - np.uint64(1)
+    rows[: edge * edge] = np.uint64(0)
+    for n in range(width * width * width):
+        other = near[n]
+        if other < 0:
+            continue
+        shift = BLOCK * (n % width - blocks_out) + margin
+        y0 = BLOCK * ((n // width) % width - blocks_out) + margin  # of its first row
+        z0 = BLOCK * (n // (width * width) - blocks_out) + margin
+        for z in range(max(0, -z0), min(BLOCK, edge - z0)):
+            word = masks[other, z]
+            if word == np.uint64(0):
+                continue
+            for y in range(max(0, -y0), min(BLOCK, edge - y0)):
+                byte = (word >> np.uint64(8 * y)) & np.uint64(255)
+                byte = byte << np.uint64(shift) if shift >= 0 else byte >> np.uint64(-shift)
+                rows[(z0 + z) * edge + y0 + y] |= byte & all_bits
+
+
+@njit(cache=True, nogil=True)
+def gather(blocks, observable, block, margin, halo):  # type: ignore[no-untyped-def]
+    """List the occupied voxels up to `margin` (at most WIDEST) beyond a block."""
+    blocks_out = (margin + 7) >> 3
+    width = 2 * blocks_out + 1
+    edge = BLOCK + 2 * margin
+    find_near(blocks, block, blocks_out, halo.near)
+    fill_rows(blocks.occupied, halo.near, blocks_out, margin, halo.rows)
+    words, poses, places = halo.listed[0], halo.listed[1], halo.listed[2]
+    count = 0
+    for line in range(edge * edge):
+        halo.first[line] = count
+        row = halo.rows[line]
+        if row == np.uint64(0):
+            continue
+        y, z = line % edge - margin, line // edge - margin
+        start = width * ((y >> 3) + blocks_out) + width * width * ((z >> 3) + blocks_out)
+        inside = 64 * (z & 7) + 8 * (y & 7)
+        place = ((y + margin) << 8) | ((z + margin) << 16)
+        while row != np.uint64(0):
+            bit = np.int64(trailing_zeros(row))
+            row &= row - np.uint64(1)
+            x = bit - margin
+            other = halo.near[start + (x >> 3) + blocks_out]
+            seen = observable[blocks.rows[other, inside + (x & 7)]]
+            words[count] = seen
+            poses[count] = seen >> 32
+            places[count] = place | bit
+            count += 1
+
+
+@njit(cache=True, nogil=True)
+def take(halo, margin, x, y, z, r, most, poses_too, out):  # type: ignore[no-untyped-def]
+    """Copy what lies within r (Chebyshev, at most `margin`) of the voxel x, y, z of the block to
+    out (LISTS, > most), the high halves of the observables if `poses_too`. Returns how many."""
+    edge = BLOCK + 2 * margin
+    words, poses, places = halo.listed[0], halo.listed[1], halo.listed[2]
+    out_words, out_poses, out_places = out[0], out[1], out[2]
+    low = np.uint64(x + margin - r)
+    cube = (np.uint64(1) << np.uint64(2 * r + 1)) - np.uint64(1)
+    before = (np.uint64(1) << low) - np.uint64(1)
+    count = 0
+    for k in range(z + margin - r, z + margin + r + 1):
+        for line in range(k * edge + y + margin - r, k * edge + y + margin + r + 1):
+            row = (halo.rows[line] >> low) & cube
+            if row == np.uint64(0):
+                continue
+            start = halo.first[line] + np.int64(population(halo.rows[line] & before))
+            end = start + np.int64(population(row))
+            if count + end - start > most:
+                return count
+            if poses_too:
+                out_poses[count : count + end - start] = poses[start:end]
+            for i in range(start, end):
+                out_words[count] = words[i]
+                out_places[count] = places[i]
+                count += 1
+    return count
