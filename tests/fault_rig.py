@@ -52,6 +52,10 @@ class Line:
         self._recorder.commit()
         return self
 
+    def update(self) -> None:
+        """Derive what is stale."""
+        self._pipeline.update()
+
     def finish(self) -> None:
         """No message will come any more."""
         self._pipeline.finish()
