@@ -48,7 +48,8 @@ class Line:
             self._recorder.write(envelope)
             self.account.arrive(source_of(envelope))
             self._pipeline.insert(envelope)
-            assert self.account.balance().is_exact
+            balance = self.account.balance()
+            assert balance.is_exact, f"out of balance: {balance}"
         self._recorder.commit()
         return self
 
