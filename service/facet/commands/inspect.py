@@ -13,8 +13,10 @@ import typer
 from facet.checkpoint import is_checkpoint, read_checkpoint
 from facet.commands.terminal import Exit, err, existing, megabytes, out, table
 from facet.config import Config
+from facet.robots import dialects_of, recorded_robots
 from facet.sequences import SequenceLedger
-from facet.sources.naming import is_scan, source_of
+from facet.sources.dialects import Dialects
+from facet.sources.naming import is_input, is_scan, source_of
 from facet.sources.recording import Recording
 from facet_protocol import topics
 from facet_protocol.codec import decode
@@ -29,6 +31,7 @@ class Channel:
     """One topic of a recording."""
 
     schema: str
+    dialect: str  # how it says what it is; "derived" by Facet, or "not read"
     num_messages: int = 0
     num_bytes: int = 0
     first_ns: int = 0
@@ -39,7 +42,8 @@ class Channel:
 class Contents:
     """What a recording holds, by topic and by source."""
 
-    channels: dict[str, Channel] = field(default_factory=dict)
+    dialects: Dialects = field(default_factory=Dialects)
+    channels: dict[tuple[str, str], Channel] = field(default_factory=dict)  # by topic and schema
     scans: Counter[str] = field(default_factory=Counter)
     duplicates: Counter[str] = field(default_factory=Counter)
     losses: Counter[str] = field(default_factory=Counter)  # what the log says of itself
@@ -48,18 +52,29 @@ class Contents:
 
     def note(self, envelope: Envelope) -> None:
         """Count one message."""
-        channel = self.channels.setdefault(envelope.key, Channel(envelope.schema))
+        name = (envelope.key, envelope.schema)
+        if name not in self.channels:
+            self.channels[name] = Channel(envelope.schema, self._dialect(envelope))
+        channel = self.channels[name]
         channel.num_messages += 1
         channel.num_bytes += len(envelope.payload)
         channel.first_ns = channel.first_ns or envelope.received_ns
         channel.last_ns = max(channel.last_ns, envelope.received_ns)
         if is_scan(envelope):
-            source = source_of(envelope.key)
+            source = source_of(envelope)
             self.scans[source] += 1
             if not self.ledger.note(source, envelope.epoch, envelope.sequence).is_new:
                 self.duplicates[source] += 1
         elif envelope.key in (topics.CUT_TOPIC, topics.LOSS_TOPIC):
             self._note_own(envelope)
+
+    def _dialect(self, envelope: Envelope) -> str:
+        if is_input(envelope):
+            name = (envelope.key, envelope.schema, envelope.encoding)
+            found = self.dialects.recognise_channel(*name)
+            return str(found.dialect) if found else "not read"
+        is_own = envelope.is_derived or envelope.key.startswith("/facet/")
+        return "derived" if is_own else "not read"
 
     def _note_own(self, envelope: Envelope) -> None:
         try:
@@ -92,7 +107,8 @@ def info(
     if is_checkpoint(file):
         _checkpoint_info(file)
         return
-    recording, contents = Recording([file]), Contents()
+    dialects = dialects_of(recorded_robots(Recording([file]).head()))
+    recording, contents = Recording([file], dialects), Contents(dialects)
     for envelope in recording:
         contents.note(envelope)
     _print_contents(recording, contents)
@@ -107,9 +123,10 @@ def _print_contents(recording: Recording, contents: Contents) -> None:
         last_ns = max(channel.last_ns for _, channel in channels)
         out.print(f"{_utc(min(firsts))} to {_utc(last_ns)}, {(last_ns - min(firsts)) * 1e-9:.1f} s")
     rows = [
-        (topic, c.schema, c.num_messages, megabytes(c.num_bytes), _rate(c)) for topic, c in channels
+        (topic, c.schema, c.dialect, c.num_messages, megabytes(c.num_bytes), _rate(c))
+        for (topic, _), c in channels
     ]
-    table("channels", ("topic", "schema", "messages", "size", "Hz"), rows)
+    table("channels", ("topic", "schema", "dialect", "messages", "size", "Hz"), rows)
     missing, epochs = contents.ledger.missing(), contents.ledger.num_epochs()
     sources = [
         (s, n, epochs.get(s, 0), missing.get(s, 0), contents.duplicates[s])

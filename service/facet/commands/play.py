@@ -13,11 +13,18 @@ import zenoh.ext
 
 from facet.commands.terminal import err, existing, out, progress
 from facet.session import DEFAULT_ENDPOINT, client_settings, open_session
-from facet.sources.naming import is_scan, robot_and_sensor
+from facet.sources.naming import (
+    TRANSFORM_SCHEMAS,
+    is_input,
+    is_scan,
+    is_static,
+    names_of,
+    pose_frame,
+)
 from facet.sources.recording import Recording
 from facet_protocol import attachment
 from facet_protocol.messages import Envelope
-from facet_protocol.topics import check_id, scan_key
+from facet_protocol.topics import check_id, pose_key, scan_key, transforms_key
 
 CACHE_BYTES = 64 << 20  # kept for a service that stalled: at 40 Hz of line scans, minutes
 HEARTBEAT_S = 0.2
@@ -25,7 +32,8 @@ LISTENER_S = 5.0
 
 
 class RobotPublisher:
-    """Publishes scans with a sequence number of their own and keeps the last ones to send again."""
+    """Publishes scans, and poses where they come apart, with sequence numbers of their own, and
+    keeps the last ones to send again."""
 
     def __init__(self, session: zenoh.Session, map_id: str) -> None:
         self._session, self._map_id = session, map_id
@@ -34,8 +42,8 @@ class RobotPublisher:
         self._sequences: dict[str, int] = {}
 
     def publish(self, robot: str, sensor: str, envelope: Envelope) -> None:
-        """Send one scan as it is; the first on a key waits for someone to listen."""
-        key = scan_key(self._map_id, robot, sensor)
+        """Send one message as it is; the first on a key waits for someone to listen."""
+        key = self._key(robot, sensor, envelope)
         if key not in self._publishers:
             self._publishers[key] = self._declare(key, envelope)
         self._sequences[key] = sequence = self._sequences.get(key, 0) + 1
@@ -50,6 +58,13 @@ class RobotPublisher:
         time.sleep(2 * HEARTBEAT_S)
         for publisher in self._publishers.values():
             publisher.undeclare()  # type: ignore[no-untyped-call]
+
+    def _key(self, robot: str, sensor: str, envelope: Envelope) -> str:
+        if is_scan(envelope):
+            return scan_key(self._map_id, robot, sensor)
+        if envelope.schema in TRANSFORM_SCHEMAS:
+            return transforms_key(self._map_id, robot, static=is_static(envelope))
+        return pose_key(self._map_id, robot, pose_frame(envelope))
 
     def _declare(self, key: str, first: Envelope) -> zenoh.ext.AdvancedPublisher:
         num_kept = max(16, min(4096, CACHE_BYTES // max(1, len(first.payload))))
@@ -86,17 +101,19 @@ def _has_listener(session: zenoh.Session, key: str) -> bool:
 def play_scans(
     scans: Iterator[Envelope], publisher: RobotPublisher, robot: str | None, speed: float
 ) -> Iterator[int]:
-    """Publish each scan at its stamp, `speed` times as fast (0: at once); counts them."""
+    """Publish each message at its stamp, `speed` times as fast (0: at once); counts the scans."""
     first_ns: int | None = None
     started = time.monotonic()
-    for num, envelope in enumerate(scans, start=1):
+    num = 0
+    for envelope in scans:
         stamp_ns = envelope.stamp_ns or envelope.received_ns
         first_ns = stamp_ns if first_ns is None else first_ns
         if speed:
             wait_s = (stamp_ns - first_ns) * 1e-9 / speed - (time.monotonic() - started)
             time.sleep(max(0.0, wait_s))
-        source_robot, sensor = robot_and_sensor(envelope.key)
+        source_robot, sensor = names_of(envelope)
         publisher.publish(robot or source_robot, sensor, envelope)
+        num += is_scan(envelope)
         yield num
 
 
@@ -114,7 +131,7 @@ def play(
     ] = None,
     shared_memory: Annotated[bool, typer.Option(help="Large scans by shared memory.")] = True,
 ) -> None:
-    """Publish a recording over Zenoh, as the robot would.
+    """Publish a recording over Zenoh, as the robot would; of ROS 2 too, with its transforms.
 
     \b
     facet run &                                    # somebody has to listen
@@ -130,7 +147,7 @@ def play(
         publisher = RobotPublisher(session, map_id)
         num = 0
         try:
-            for num in play_scans(filter(is_scan, recording), publisher, robot, rate):
+            for num in play_scans(filter(is_input, recording), publisher, robot, rate):
                 bar.update(bar.task_ids[0], completed=num)
         finally:
             publisher.close()

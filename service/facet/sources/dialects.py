@@ -31,7 +31,7 @@ class Dialect(StrEnum):
     NATIVE = "native"
     RMW_ZENOH = "rmw_zenoh"
     BRIDGE = "ros2dds bridge"
-    TAGGED = "ROS 2, tagged"
+    TAGGED = "ROS 2"
     PROTOBUF = "Foxglove"
     RULE = "rule"
 
