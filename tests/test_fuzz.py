@@ -1,6 +1,6 @@
 """Broken bytes at every door: an error of ours, or a value; never anything else (G6, P14).
 
-Each target is fed mutants of good examples for FACET_FUZZ_S seconds, 3 by default; `make soak`
+Each target is fed mutants of good examples for FACET_FUZZ_S seconds, 2 by default; `make soak`
 gives each a minute, and any time may be set. A failure names the seed and the bytes.
 """
 
@@ -37,7 +37,7 @@ from fault_rig import Line, envelopes
 from rig import room
 from test_checkpoint import sample
 
-SECONDS = float(os.environ.get("FACET_FUZZ_S", "3"))
+SECONDS = float(os.environ.get("FACET_FUZZ_S", "2"))
 SOAK_S = 60.0
 SEED = int(os.environ.get("FACET_FUZZ_SEED", "0")) or time.time_ns() % 2**32
 NUMBERS = (0, 1, 0x7F, 0x80, 0xFF, 0xFFFF, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1)

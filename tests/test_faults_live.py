@@ -1,0 +1,307 @@
+"""Faults of a running service (F16, F19-F23, F26, F29, F30; G13, G15): its threads in this
+process, robots over real sessions."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+import zenoh
+
+from facet.config import NetworkSection, load_config
+from facet.mapping.mapper import Mapper
+from facet.pipeline import Pipeline
+from facet.service import Service
+from facet.session import client_settings, open_session, service_settings
+from facet.sinks.durable_file import DurableFile
+from facet.sources.recording import Recording
+from facet.status import balance_of
+from facet_protocol import attachment, topics
+from facet_protocol.codec import decode
+from facet_protocol.messages import Loss, Status
+from fault_rig import SETTINGS, small_scan
+from rig import START_NS, free_endpoint, scan_envelope, wait_until
+from test_service import break_disk, running, send
+
+PAYLOAD = bytes(scan_envelope(small_scan(1)).payload)
+KEY = topics.scan_key("map", "r1", "lidar")
+Log = pytest.LogCaptureFixture
+
+
+def put(client: zenoh.Session, sequence: int, epoch: int = 5, robot: str = "r1") -> None:
+    """One scan of a publisher that is not ours."""
+    client.put(
+        topics.scan_key("map", robot, "lidar"),
+        PAYLOAD,
+        encoding="application/protobuf;foxglove.PointCloud",
+        congestion_control=zenoh.CongestionControl.BLOCK,
+        attachment=attachment.pack(epoch, sequence, START_NS + sequence),
+    )
+
+
+def wait_for_ear(client: zenoh.Session) -> None:
+    """What is sent before the subscriber is known is lost."""
+    publisher = client.declare_publisher(KEY)
+    wait_until(lambda: publisher.matching_status.matching)
+    publisher.undeclare()
+
+
+def losses(folder: Path) -> list[tuple[str, int, int, str]]:
+    logged = [decode(e) for e in Recording([folder]) if e.key == topics.LOSS_TOPIC]
+    return [(x.robot, x.first_sequence, x.count, x.reason) for x in logged if isinstance(x, Loss)]
+
+
+def in_balance(service: Service) -> None:
+    for source in ("", *service.account.sources()):
+        assert service.account.balance(source).is_exact
+
+
+def test_f19_gaps_and_late_arrivals(tmp_path: Path, caplog: Log) -> None:
+    """Counted at once, logged as ranges, and taken back when the missing comes after all."""
+    with running(tmp_path) as (service, _, client):
+        wait_for_ear(client)
+        for sequence in (1, 2, 6, 7, 4):
+            put(client, sequence)
+        put(client, 1, robot="r2")
+        wait_until(lambda: service.account["applied"] == 6, 60)
+        account = service.account
+        assert account["lost_upstream[r1/lidar]"] == account["lost_upstream"] == 2  # 3 and 5
+        assert account["recovered_late[r1/lidar]"] == 1
+        assert account["lost_upstream[r2/lidar]"] == 0
+        in_balance(service)
+        service.stop()
+    assert losses(tmp_path) == [("r1", 3, 3, "lost_upstream"), ("r1", 4, 1, "recovered_late")]
+    said = [m for m in caplog.messages if "lost_upstream" in m]
+    assert said == ["r1/lidar: lost_upstream: 3 scans from sequence 3"]
+
+
+def test_f20_a_publisher_that_begins_anew(tmp_path: Path) -> None:
+    """No loss, no duplicate: its numbers belong to its epoch."""
+    with running(tmp_path) as (service, _, client):
+        wait_for_ear(client)
+        for epoch, sequence in ((5, 100), (5, 101), (6, 1), (6, 2)):
+            put(client, sequence, epoch)
+        wait_until(lambda: service.account["applied"] == 4, 60)
+        account = service.account
+        assert account["source_restarted[r1/lidar]"] == 1
+        assert account["lost_upstream"] == account["duplicate"] == 0
+        assert account["duplicate_publisher"] == 0
+        service.stop()
+    assert losses(tmp_path) == []
+
+
+def test_f21_two_publishers_under_one_name(tmp_path: Path, caplog: Log) -> None:
+    with running(tmp_path) as (service, _, client):
+        wait_for_ear(client)
+        for sequence in (1, 2, 3):
+            put(client, sequence, epoch=5)
+            put(client, sequence, epoch=6)
+        wait_until(lambda: service.account["applied"] == 6, 60)
+        assert service.account["duplicate_publisher[r1/lidar]"] == 4
+        in_balance(service)
+        service.stop()
+    assert len([m for m in caplog.messages if "two publishers share the name" in m]) == 1
+
+
+@pytest.mark.parametrize("step_s", [-86400, 86400])
+def test_f22_the_clock_steps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step_s: int) -> None:
+    """A day back or ahead while it runs: log time never goes back, at most one new file, and
+    nothing waits for the clock."""
+    wall = time.time_ns
+    with running(tmp_path) as (service, robot, _):
+        send(robot, 1, 3)
+        wait_until(lambda: service.account["applied"] == 3, 60)
+        monkeypatch.setattr(time, "time_ns", lambda: wall() + step_s * 10**9)
+        service._inbox._clock_ns = time.time_ns
+        service.recorder._clock = time.time_ns
+        send(robot, 4, 8)
+        wait_until(lambda: service.account["applied"] == 8, 60)
+        service.stop()
+    times = [e.received_ns for e in Recording([tmp_path])]
+    assert times == sorted(times)
+    assert len(service.recorder.paths) <= 2
+    assert all(v >= 0 for v in service.account.status("map", 1, 1).stage_ms.values())
+
+
+def slow_mapper(monkeypatch: pytest.MonkeyPatch, seconds: float) -> threading.Event:
+    """Every scan takes so long, until the event is set."""
+    quick, insert = threading.Event(), Pipeline.insert
+
+    def slowly(self: Pipeline, envelope: Any) -> bool:
+        quick.wait(seconds)
+        return insert(self, envelope)
+
+    monkeypatch.setattr(Pipeline, "insert", slowly)
+    return quick
+
+
+def overload(folder: Path, monkeypatch: pytest.MonkeyPatch, seconds: float) -> None:
+    """F23: ten times what can be mapped. The law at every instant, every queue within its bounds,
+    what is shed is the truth, and all is well within five seconds after."""
+    limits = {"queue.max_messages": 64, "queue.max_bytes": 1 << 20, "queue.patience_s": 0.2}
+    with running(folder, **limits) as (service, _, client):
+        wait_for_ear(client)
+        quick = slow_mapper(monkeypatch, 0.025)  # 40 a second
+        rss = psutil.Process().memory_info().rss
+        end, sent = time.monotonic() + seconds, 0
+        while time.monotonic() < end:
+            sent += 1
+            put(client, sent)
+            in_balance(service)
+            assert len(service._inbox) <= 64
+            assert service._inbox.num_bytes <= 1 << 20
+            time.sleep(0.0025)  # 400 a second
+        quick.set()
+        put(client, sent + 1)  # the last one shows what went before it
+        wait_until(lambda: service.account.balance().in_flight == 0, 5)
+        balance, account = service.account.balance(), service.account
+        assert account["shed_overload"] > 0
+        assert account["lost_upstream"] + balance.received == sent + 1
+        assert balance.applied + account["shed_overload"] == balance.received
+        assert account["recorded"] == balance.applied
+        assert psutil.Process().memory_info().rss - rss < 64 << 20
+        service.stop()
+    logged = losses(folder)
+    for reason in ("shed_overload", "lost_upstream"):
+        assert sum(count for *_, count, why in logged if why == reason) == account[reason]
+    statuses = [decode(e) for e in Recording([folder]) if e.key == topics.STATUS_TOPIC]
+    assert all(balance_of(s.counters, s.gauges).is_exact for s in statuses if isinstance(s, Status))
+
+
+def test_g15_overload(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    overload(tmp_path, monkeypatch, 4.0)
+
+
+@pytest.mark.slow
+def test_g15_overload_for_a_minute(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    overload(tmp_path, monkeypatch, 60.0)
+
+
+def test_f29_without_a_disk_nothing_is_acknowledged(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In flight as long as the disk fails, health FAIL; then all of every robot is there."""
+    with running(tmp_path, **{"record.retry_s": 0.05}) as (service, robot, client):
+        wait_for_ear(client)
+        disk = break_disk(service, monkeypatch)
+        send(robot, 1, 3)
+        put(client, 1, robot="r2")
+        wait_until(lambda: service.account["recorder_failed"])
+        wait_until(lambda: service.account.balance().in_flight == 4)
+        assert service.account.status("map", 1, 1).health == "FAIL"
+        assert service.account["recorded"] == 0
+        in_balance(service)
+        disk.set()
+        wait_until(lambda: service.account["applied"] == 4, 60)
+        assert service.account.balance().in_flight == 0
+        service.stop()
+
+
+def test_f30_a_slow_disk_loses_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def fdatasync(fd: int) -> None:
+        time.sleep(0.5)  # the fault itself
+        os.fdatasync(fd)
+
+    with running(tmp_path) as (service, robot, _):
+        monkeypatch.setattr(
+            service.recorder, "_open_file", lambda path: DurableFile(path, sync_data=fdatasync)
+        )
+        send(robot, 1, 10)
+        wait_until(lambda: service.account["applied"] == 10, 60)
+        assert service.account.status("map", 1, 1).gauges["commit_ms"] >= 500
+        service.stop()
+    assert service.account["lost_upstream"] == service.account["shed_overload"] == 0
+
+
+@contextmanager
+def timed(folder: Path) -> Iterator[tuple[Service, zenoh.Session, str, list[float]]]:
+    """A service, a client, the endpoint, and how long each scan took from the door to the disk."""
+    endpoint, acks = free_endpoint(), list[float]()
+    options = {"record.directory": folder, "record.min_free_bytes": 0}
+    network = NetworkSection(listen=(endpoint,), shared_memory=False)
+    with (
+        open_session(service_settings(network)) as session,
+        open_session(client_settings(endpoint, shared_memory=False)) as client,
+    ):
+        service = Service(session, load_config(None, options), Mapper(SETTINGS))
+        put_on = service._durable.put
+
+        def put_timed(envelopes: list[Any], *more: Any) -> None:
+            now = time.time_ns()
+            acks.extend((now - e.received_ns) * 1e-6 for e in envelopes)
+            put_on(envelopes, *more)
+
+        service._durable.put = put_timed  # type: ignore[method-assign]
+        service.start()
+        wait_for_ear(client)
+        yield service, client, endpoint, acks
+
+
+def tree(process: subprocess.Popen[bytes]) -> list[psutil.Process]:
+    return [*psutil.Process(process.pid).children(recursive=True), psutil.Process(process.pid)]
+
+
+def with_viewers(folder: Path, seconds: float) -> dict[str, tuple[float, float]]:
+    """(median, 99 %) of the ms from the door to the disk: without a viewer, with one, with one that
+    is stopped, and after it was killed. Every scan is mapped in each."""
+    found, sent = {}, 0
+    with timed(folder) as (service, client, endpoint, acks):
+
+        def drive(name: str) -> None:
+            nonlocal sent
+            acks.clear()
+            end = time.monotonic() + seconds
+            while time.monotonic() < end:
+                sent += 1
+                put(client, sent)
+                time.sleep(0.01)
+            wait_until(lambda: service.account["applied"] == sent, 10)
+            found[name] = (float(np.median(acks)), float(np.percentile(acks, 99)))
+
+        drive("warm")
+        drive("none")
+        command = [sys.executable, "-m", "facet.sinks.viewer", endpoint, "map", "web"]
+        viewer = subprocess.Popen(command, stderr=subprocess.DEVNULL)
+        try:
+            wait_until(lambda: len(tree(viewer)) > 1, 30)
+            drive("running")
+            for process in tree(viewer):
+                process.send_signal(signal.SIGSTOP)
+            drive("stopped")
+            for process in tree(viewer):
+                process.kill()
+            drive("killed")
+        finally:
+            viewer.kill()
+            viewer.wait()
+        started = time.monotonic()
+        service.stop()
+        assert time.monotonic() - started < 5.0
+        assert service.account["lost_upstream"] == service.account["shed_overload"] == 0
+    return found
+
+
+def test_g13_viewers(tmp_path: Path) -> None:
+    """F26: whatever the viewer does, every scan comes in and is mapped, as soon as without."""
+    found = with_viewers(tmp_path, 1.5)
+    for name in ("running", "stopped", "killed"):
+        assert found[name][0] <= found["none"][0] + 20.0, found
+
+
+@pytest.mark.slow
+def test_g13_viewers_for_a_minute(tmp_path: Path) -> None:
+    found = with_viewers(tmp_path, 60.0)
+    sys.stdout.write(f"G13: ack ms (median, 99 %): {found}\n")
+    for name in ("running", "stopped", "killed"):
+        assert found[name][1] <= found["none"][1] + 20.0, found
