@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from facet.mapping.adaptive import make_rule
 from facet.mapping.mapper import Mapper
-from facet.mapping.normals import CLASS_NAMES, make_rule
+from facet.mapping.normals import CLASS_NAMES
 from facet.mapping.settings import MapSettings
 from facet_protocol.messages import ScanKind
 from mapping_logs import cloud, log, mapped, wall

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from typing import Any
+
 import numpy as np
 from numba import njit
 from numpy.typing import NDArray
@@ -33,6 +36,21 @@ class Census:
         self._points_stored += sign * len(ticks.points)
         for reason, number in ticks.rejected.items():
             self._rejected[reason] = self._rejected.get(reason, 0) + sign * number
+
+    def freeze(self) -> dict[str, Any]:
+        """What was counted, as JSON."""
+        return {
+            "scans": self._scans,
+            "points_in": self._points_in,
+            "points_stored": self._points_stored,
+            "rejected": self._rejected,
+        }
+
+    def restore(self, frozen: Mapping[str, Any]) -> None:
+        """Go on from `freeze`."""
+        self._scans, self._points_in = int(frozen["scans"]), int(frozen["points_in"])
+        self._points_stored = int(frozen["points_stored"])
+        self._rejected = {str(k): int(n) for k, n in frozen["rejected"].items()}
 
     def take(
         self, store: VoxelStore, normals: Normals, tiles: TileField, sigma_m: float

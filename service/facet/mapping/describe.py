@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -51,6 +52,24 @@ class Describer:
     def planes(self) -> list[Plane]:
         """All planes, by ascending id."""
         return [self._entries[i].plane for i in sorted(self._entries)]
+
+    @property
+    def next_surface(self) -> int:
+        """The id of the next new surface."""
+        return self._next_surface
+
+    def restore(self, known: Mapping[int, tuple[int, list[int]]], next_surface: int) -> None:
+        """Give planes just described the revisions and surface ids that they had, by plane id.
+
+        Raises ValueError where they are others."""
+        if known.keys() != self._entries.keys():
+            raise ValueError(f"{len(known)} planes were described, now {len(self._entries)}")
+        for plane_id, (revision, ids) in known.items():
+            entry = self._entries[plane_id]
+            surfaces = zip(entry.plane.surfaces, ids, strict=True)
+            kept = tuple(replace(surface, id=i) for surface, i in surfaces)
+            entry.plane = replace(entry.plane, revision=revision, surfaces=kept)
+        self._next_surface = next_surface
 
     def __getitem__(self, plane_id: int) -> Plane:
         return self._entries[plane_id].plane

@@ -111,6 +111,20 @@ class FreeSpace:
         self._table = rehash(self._keys, 0, 4 * FIRST_BLOCKS)
         self.num_blocks = 0
 
+    def freeze(self) -> tuple[Int64Array, NDArray[np.int32]]:
+        """Copies of block keys (B,) and their cells' counts (B, 512)."""
+        return self._keys[: self.num_blocks].copy(), self._counts[: self.num_blocks].copy()
+
+    def restore(self, keys: Int64Array, counts: NDArray[np.int32]) -> None:
+        """Become what was frozen. Raises ValueError for what does not fit together."""
+        if counts.shape != (len(keys), 512) or len(np.unique(keys)) < len(keys):
+            raise ValueError(f"{counts.shape} cells for {len(keys)} blocks of free space")
+        capacity = max(FIRST_BLOCKS, len(keys))
+        self._keys, self._counts = np.zeros(capacity, np.int64), np.zeros((capacity, 512), np.int32)
+        self._keys[: len(keys)], self._counts[: len(keys)] = keys, counts
+        self._table = rehash(self._keys, len(keys), 4 << (capacity - 1).bit_length())
+        self.num_blocks = len(keys)
+
     def insert(self, ticks: Ticks) -> None:
         """Count a scan's beams."""
         self._apply(ticks, 1)
@@ -148,7 +162,7 @@ class FreeSpace:
         keys, counts = np.zeros(capacity, np.int64), np.zeros((capacity, 512), np.int32)
         keys[: len(self._keys)], counts[: len(self._counts)] = self._keys, self._counts
         self._keys, self._counts = keys, counts
-        self._table = rehash(keys, self.num_blocks, 4 * capacity)
+        self._table = rehash(keys, self.num_blocks, 4 << (capacity - 1).bit_length())
 
 
 @njit(cache=True, nogil=True)

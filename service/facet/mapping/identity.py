@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -35,6 +36,17 @@ class Identity:
         self._next = 1
         self._alive: set[int] = set()
         self._events = 0
+
+    def freeze(self) -> dict[str, int]:
+        """Where counting stands, as JSON."""
+        return {"next": self._next, "events": self._events}
+
+    def restore(self, frozen: Mapping[str, int], ids: NDArray[np.int64]) -> None:
+        """Go on from `freeze`, with these ids (K,) alive. Raises ValueError for one to come."""
+        self._next, self._events = int(frozen["next"]), int(frozen["events"])
+        if ids.max(initial=0) >= self._next:
+            raise ValueError(f"plane {ids.max()} is there, and the next one would be {self._next}")
+        self._alive = set(ids.tolist())
 
     def assign(self, count: int, heritage: Heritage) -> Lineage:
         """Ids for `count` planes, given what they share with those of the last update."""

@@ -42,6 +42,16 @@ class Inserted(NamedTuple):
     rejected: dict[str, int]
 
 
+class Grouped(NamedTuple):
+    """What became of blocks and tiles, and the planes' points."""
+
+    regrouped: NDArray[np.int32]  # blocks: patches changed
+    relabelled: NDArray[np.int32]  # blocks: labels changed
+    grown: list[int]  # tiles: tile-planes grown again
+    changed: list[int]  # tiles: their voxels changed
+    points: PointFit
+
+
 class Mapper:
     """The planar map of one place: a pure function of the scans inserted and not retracted.
 
@@ -96,39 +106,17 @@ class Mapper:
         num_stale, turned = self._normals.update(store, dirty)
         done("normals")
         moved = np.unique(store.columns.block[dirty])
-        regrouped, relabelled, summed = self._patches.update(
-            store, self._normals.normals, np.union1d(turned, moved), touched
-        )
-        done("patches")
-        limit = limits(self.settings, self._patches.sigma() / TICKS)
-        grown, changed = self._tiles.update(
-            store, self._patches, limit, regrouped, relabelled, summed, moved
-        )
-        done("tiles")
-        self._table = tabulate(self._tiles.tiles)
-        self._planes = group_planes(self._table, limit, self.settings, self._bends.flat)
-        points = fit_points(self._table, self._planes, self.settings.voxel_m)
-        done("planes")
-        lineage = self._identity.assign(len(points.total), self._heritage())
-        members, renamed = self._name(lineage.ids)
-        figures = self._figures(lineage.ids, points, members)
-        done("identity")
-        self._contours.update(
-            store, self._tiles.tiles, set(changed),
-            {i: (figures[i].fit.inside, members[i]) for i in figures},
-        )  # fmt: skip
-        done("contours")
-        updated = self._describer.update(figures, self._contours.contours, self._free)
-        done("describe")
-        self.changed_tiles = [unpack(key) for key in sorted({*changed, *renamed})]
+        grouped = self.group(np.union1d(turned, moved), moved, touched, done)
+        lineage = self._identity.assign(len(grouped.points.total), self._heritage())
+        updated = self.outline(lineage.ids, grouped, done)
         self.work = {
             "touched_voxels": len(touched),
             "dirty_voxels": len(dirty),
             "stale_voxels": num_stale,
-            "blocks_regrouped": len(regrouped),
-            "blocks_relabelled": len(relabelled),
-            "tiles_regrouped": len(grown),
-            "tiles_changed": len(changed),
+            "blocks_regrouped": len(grouped.regrouped),
+            "blocks_relabelled": len(grouped.relabelled),
+            "tiles_regrouped": len(grouped.grown),
+            "tiles_changed": len(grouped.changed),
             "tile_planes": len(self._planes.label),
             "outline_tiles": self._contours.rolled,
             "planes_changed": len(updated),
@@ -143,6 +131,47 @@ class Mapper:
             retired=lineage.retired,
             events=self._identity.events(lineage, updated, self.revision, self._stamp_ns),
         )
+
+    def group(
+        self,
+        turned: NDArray[np.int32],
+        moved: NDArray[np.int32],
+        touched: NDArray[np.int32],
+        done: Timer = lambda stage: None,
+    ) -> Grouped:
+        """Planes from normals: group again what blocks with changed normals (`turned`), changed
+        centroids (`moved`) and rows with changed moments (`touched`) make stale."""
+        regrouped, relabelled, summed = self._patches.update(
+            self._store, self._normals.normals, turned, touched
+        )
+        done("patches")
+        limit = limits(self.settings, self._patches.sigma() / TICKS)
+        grown, changed = self._tiles.update(
+            self._store, self._patches, limit, regrouped, relabelled, summed, moved
+        )
+        done("tiles")
+        self._table = tabulate(self._tiles.tiles)
+        self._planes = group_planes(self._table, limit, self.settings, self._bends.flat)
+        points = fit_points(self._table, self._planes, self.settings.voxel_m)
+        done("planes")
+        return Grouped(regrouped, relabelled, grown, changed, points)
+
+    def outline(
+        self, ids: NDArray[np.int64], grouped: Grouped, done: Timer = lambda stage: None
+    ) -> list[int]:
+        """Figures and outlines of the planes, under their ids (K,). Returns those that changed."""
+        members, renamed = self._name(ids)
+        figures = self._figures(ids, grouped.points, members)
+        done("identity")
+        self._contours.update(
+            self._store, self._tiles.tiles, set(grouped.changed),
+            {i: (figures[i].fit.inside, members[i]) for i in figures},
+        )  # fmt: skip
+        done("contours")
+        updated = self._describer.update(figures, self._contours.contours, self._free)
+        done("describe")
+        self.changed_tiles = [unpack(key) for key in sorted({*grouped.changed, *renamed})]
+        return updated
 
     def snapshot(self) -> MapUpdate:
         """Everything, as of the last update."""

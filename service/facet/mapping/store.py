@@ -6,7 +6,8 @@ remove is the exact inverse of insert. `settle` says which voxels' observables c
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from facet.mapping.blocks import Blocks, add_block, find, pack, rehash, unpack_all
 from facet.mapping.quantise import VIEW, Ticks
-from facet.mapping.settings import TICKS
+from facet.mapping.settings import BLOCK, TICKS
 
 # columns of `moments`: n, sum x, y, z, sum xx, xy, xz, yy, yz, zz of the local ticks 0..1023
 MOMENTS = 10
@@ -176,6 +177,24 @@ def _settle(blocks, columns, touched_rows, num_touched, dirty_rows):  # type: ig
     return num_dirty
 
 
+@njit(cache=True, nogil=True)
+def _add_blocks(blocks, keys):  # type: ignore[no-untyped-def]
+    """Add the blocks of keys (B,) to none. How many."""
+    for b in range(keys.shape[0]):
+        add_block(blocks, b, keys[b])
+    return keys.shape[0]
+
+
+@njit(cache=True, nogil=True)
+def _place(blocks, columns, rows):  # type: ignore[no-untyped-def]
+    """Enter rows in their blocks."""
+    for row in range(rows):
+        block, local = columns.block[row], columns.local[row]
+        blocks.rows[block, local] = row
+        if columns.observable[row] != 0:
+            blocks.occupied[block, local >> 6] |= np.uint64(1) << np.uint64(local & 63)
+
+
 def _grown(array: NDArray[np.generic], capacity: int, fill: int) -> NDArray[np.generic]:
     out = np.empty((capacity, *array.shape[1:]), array.dtype)
     out[: len(array)] = array
@@ -210,6 +229,31 @@ class VoxelStore:
         self.num_rows = 0
         self._touched_rows = np.empty(4096, np.int32)
         self._num_touched = 0
+
+    def restore(self, columns: Mapping[str, NDArray[Any]], block_keys: NDArray[np.int64]) -> None:
+        """Become the store whose columns by row (V,) and block keys (B,) these are.
+
+        Raises ValueError where they do not fit together."""
+        rows, blocks = len(columns["block"]), len(block_keys)
+        fresh: dict[str, Any] = {}
+        for name, empty in self.columns._asdict().items():
+            column, length = columns[name], len(columns[name])
+            right = length == rows or (name == "poses" and length == 0)
+            if not right or column.shape[1:] != empty.shape[1:] or column.dtype != empty.dtype:
+                raise ValueError(f"{name} is {column.dtype} {column.shape} for {rows} voxels")
+            capacity = rows + 4096 if length or name != "poses" else 0
+            fresh[name] = _grown(column, capacity, 0)
+        self.columns = Columns(**fresh)
+        block, local = self.columns.block[:rows], self.columns.local[:rows]
+        if rows and not (block.min() >= 0 and block.max() < blocks):
+            raise ValueError(f"a voxel lies in no one of {blocks} blocks")
+        if rows and not (local.min() >= 0 and local.max() < BLOCK**3):
+            raise ValueError("a voxel lies in no place of its block")
+        if len(np.unique(block_keys)) < blocks:
+            raise ValueError("a block is there twice")
+        self._grow_blocks(max(blocks + 1, 256))
+        self.num_blocks, self.num_rows = _add_blocks(self.blocks, block_keys), rows
+        _place(self.blocks, self.columns, rows)
 
     def insert(self, ticks: Ticks) -> None:
         """Add a scan's points."""
@@ -267,7 +311,7 @@ class VoxelStore:
 
     def _grow_blocks(self, capacity: int) -> None:
         old = self.blocks
-        keys, values = rehash(old.keys, self.num_blocks, 4 * capacity)
+        keys, values = rehash(old.keys, self.num_blocks, 4 << (capacity - 1).bit_length())
         self.blocks = Blocks(
             keys,
             values,

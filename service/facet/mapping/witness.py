@@ -52,6 +52,14 @@ class Witness:
             seen.last_ns = max(seen.last_ns, scan.stamp_ns)
             seen.robots.add(scan.robot)
 
+    def items(self) -> list[tuple[int, Sighting]]:
+        """Sightings by tile, ascending."""
+        return sorted(self._sightings.items())
+
+    def restore(self, sightings: dict[int, Sighting]) -> None:
+        """Go on from `items`."""
+        self._sightings = sightings
+
     def of(self, tile_keys: Iterable[int]) -> Sighting:
         """What was seen of a set of tiles."""
         seen = [self._sightings[k] for k in tile_keys if k in self._sightings]

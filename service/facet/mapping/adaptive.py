@@ -1,0 +1,215 @@
+"""The normal of one voxel by the paper's adaptive cubic region (eq. 1-25).
+
+A region is the cube of half-side r voxels round the voxel; each occupied voxel seen from the same
+side votes at its rounded centroid with weight min(points, 8). The radius follows the sign of the
+paper's stationarity condition (eq. 22) from `start_radius` until it repeats: the fixed point that
+eq. 16 approaches, without its dependence on the order of points (method.md 4.1, design 3.2).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from facet.mapping.eigen import eigenvalues, eigenvector
+from facet.mapping.halo import take
+from facet.mapping.region import MOST, covariance, decode, is_one_pose, shape, within, within_slab
+from facet.mapping.settings import STEPS, MapSettings
+
+EMPTY, VALID, ALIGNED, THICK, SPARSE, MIXED = range(6)
+WIDER = 255  # no class: the voxel must look farther than its halo
+UNIT = 256  # normals are integers: a unit vector times this
+MIN_VOTES = 4  # fewer votes than this say nothing
+
+
+class Rule(NamedTuple):
+    """The method's constants as the kernel wants them."""
+
+    sigma_target: float  # w_sigma * Lambda
+    w_sigma: float
+    w_points: float
+    growth: NDArray[np.float64]  # R_N / R (eq. 19) by number of votes, clamped
+    floor2: float  # squared sigma floor, (1/8 voxel)^2
+    tan_theta: float
+    epsilon: float
+    offset: float  # 1/8 voxels, of a voxel from the plane of its own region
+    border: float  # 1/8 voxels per voxel of radius, in the plane, from the centroid of the region
+    slab: float  # 1/8 voxels, half width of the slab that votes in the second look
+    passes: int
+    shrink: int
+    least_first: int
+    start: int
+    largest: int
+    sparse: int
+
+
+def make_rule(settings: MapSettings) -> Rule:
+    """Tabulate eq. 19-20; eq. 25 gives the weights from epsilon and Lambda."""
+    w_sigma = settings.gain * settings.epsilon / settings.lambda_target
+    counts = np.arange(4 * settings.n_max + 1)
+    few = (settings.n_0 - counts) / (settings.n_0 - settings.n_min)
+    many = -(counts - settings.n_0) / (settings.n_max - settings.n_0)
+    alpha = np.clip(
+        np.where(counts < settings.n_0, few, many), -settings.alpha_clip, settings.alpha_clip
+    )
+    growth = settings.tan_base ** np.tan(settings.tan_slope * math.pi / 2 * alpha)
+    return Rule(
+        sigma_target=w_sigma * settings.lambda_target,
+        w_sigma=w_sigma,
+        w_points=settings.gain - w_sigma,
+        growth=growth,
+        floor2=(settings.sigma_floor * STEPS) ** 2,
+        tan_theta=math.tan(math.radians(settings.theta_deg)),
+        epsilon=settings.epsilon,
+        offset=settings.own_offset * STEPS,
+        border=settings.border * STEPS,
+        slab=settings.slab * STEPS,
+        passes=settings.passes,
+        shrink=settings.shrink,
+        least_first=settings.least_first,
+        start=settings.start_radius,
+        largest=settings.max_radius,
+        sparse=MIN_VOTES,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _step(sums, r, rule):  # type: ignore[no-untyped-def]
+    """The next radius by eq. 16-20: at least one voxel up or down, at most double or half."""
+    votes = min(sums[0], rule.growth.shape[0] - 1)
+    growth = rule.growth[votes]
+    ratio = 1e-3
+    if sums[0] >= 4:
+        ratio, _ = shape(eigenvalues(*covariance(sums)), rule.floor2)
+    factor = 1.0 + rule.sigma_target / ratio - rule.w_sigma + rule.w_points * (growth - 1.0)
+    factor = min(2.0, max(0.5, factor))
+    r_next = np.int64(np.floor(r * factor + 0.5))
+    if r_next == r:
+        r_next = r + 1 if factor > 1.0 else r - 1
+    return min(rule.largest, max(1, r_next))
+
+
+@njit(cache=True, nogil=True)
+def _find_radius(halo, margin, x, y, z, seen, rule, scratch):  # type: ignore[no-untyped-def]
+    """Follow the radius until it repeats; of a cycle the smallest. (radius, reach, votes): reach is
+    the largest radius that was looked at, and so far `votes` are listed; radius 0 where it would
+    leave the halo."""
+    lists, votes, sums = scratch
+    r = rule.start
+    reach = r
+    count = take(halo, margin, x, y, z, r, MOST, seen >> 32 != 0, lists)
+    decode(lists, count, seen, x + margin, y + margin, z + margin, votes)
+    visited = np.int64(0)
+    while True:
+        within(votes, count, r, sums)
+        visited |= np.int64(1) << r
+        r_next = _step(sums, r, rule)
+        if r_next == r or (visited >> r_next) & 1:
+            if r_next < r:
+                within(votes, count, r_next, sums)
+            return min(r, r_next), reach, count
+        r = r_next
+        if r > margin:
+            return 0, reach, count
+        if r > reach:
+            reach = r
+            count = take(halo, margin, x, y, z, r, MOST, seen >> 32 != 0, lists)
+            decode(lists, count, seen, x + margin, y + margin, z + margin, votes)
+
+
+@njit(cache=True, nogil=True)
+def estimate(halo, margin, local, seen, rule, scratch):  # type: ignore[no-untyped-def]
+    """(class, nx, ny, nz, gamma in half degrees, at a border, reach) of a voxel of the block that
+    `halo` surrounds; class WIDER where the halo is too narrow to tell."""
+    lists, votes, sums = scratch
+    if seen == 0:
+        return EMPTY, 0, 0, 0, 0, False, 0
+    x, y, z = local & 7, (local >> 3) & 7, local >> 6
+    r, reach, count = _find_radius(halo, margin, x, y, z, seen, rule, scratch)
+    if r == 0:
+        return WIDER, 0, 0, 0, 0, False, 0
+    if sums[0] < rule.sparse:
+        return SPARSE, 0, 0, 0, 0, False, reach
+    one_pose = seen >> 32 != 0 and is_one_pose(lists, votes, count, r)
+    kind, nx, ny, nz, tan_gamma = _classify(sums, seen, one_pose, rule)
+    if kind == THICK and tan_gamma <= rule.tan_theta:  # beside a plane, not on it: a noise shell
+        return kind, 0, 0, 0, 255, False, reach
+    cx, cy, cz = seen & 15, (seen >> 4) & 15, (seen >> 8) & 15
+    first = (
+        r  # radius of the region that gives the first normal: smaller where the full one is thick
+    )
+    while kind != ALIGNED:
+        passes = 1 if kind == VALID else rule.passes
+        for _ in range(passes):  # look again: its own side, by the normal, and its own slab
+            own = nx * cx + ny * cy + nz * cz
+            within_slab(votes, count, r, nx, ny, nz, own, rule.slab, sums)
+            if sums[0] < rule.sparse:
+                return SPARSE, 0, 0, 0, 0, False, reach
+            kind, nx, ny, nz, tan_gamma = _classify(sums, seen, one_pose, rule)
+        first -= 1
+        if kind == VALID or first < max(1, r - rule.shrink):
+            break
+        within(votes, count, first, sums)
+        if sums[0] < rule.least_first:
+            break
+        _, nx, ny, nz, _ = _classify(sums, seen, one_pose, rule)
+        kind = THICK
+    if kind == VALID and (seen >> 31) & 1 == 1 and _towards(seen, nx, ny, nz) < 4.0:
+        kind = MIXED  # both sides of a thin thing, not one side from two directions
+    half_degrees = np.int64(np.floor(np.arctan(tan_gamma) * 114.59155902616465 + 0.5))
+    return (
+        kind,
+        np.int64(np.floor(nx * UNIT + 0.5)),
+        np.int64(np.floor(ny * UNIT + 0.5)),
+        np.int64(np.floor(nz * UNIT + 0.5)),
+        half_degrees,
+        _at_border(sums, seen, r, nx, ny, nz, rule),
+        reach,
+    )
+
+
+@njit(cache=True, nogil=True)
+def _at_border(sums, seen, r, nx, ny, nz, rule):  # type: ignore[no-untyped-def]
+    """Whether the votes lie to one side of the voxel, in the plane."""
+    w = float(sums[1])
+    dx = sums[2] / w - (seen & 15)
+    dy = sums[3] / w - ((seen >> 4) & 15)
+    dz = sums[4] / w - ((seen >> 8) & 15)
+    along = nx * dx + ny * dy + nz * dz
+    return (dx * dx + dy * dy + dz * dz) - along * along > (rule.border * r) ** 2
+
+
+@njit(cache=True, nogil=True)
+def _towards(seen, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """The normal along the view direction of the voxel with observable `seen`."""
+    return (
+        nx * (((seen >> 16) & 31) - 8)
+        + ny * (((seen >> 21) & 31) - 8)
+        + nz * (((seen >> 26) & 31) - 8)
+    )
+
+
+@njit(cache=True, nogil=True)
+def _classify(sums, seen, one_pose, rule):  # type: ignore[no-untyped-def]
+    """(class, normal towards the view, tan gamma) of the voxel with observable `seen`."""
+    a, b, c, d, e, f = covariance(sums)
+    variances = eigenvalues(a, b, c, d, e, f)
+    ratio, tan_gamma = shape(variances, rule.floor2)
+    nx, ny, nz = eigenvector(a, b, c, d, e, f, variances[2])
+    if _towards(seen, nx, ny, nz) < 0.0:
+        nx, ny, nz = -nx, -ny, -nz
+    if ratio < rule.epsilon or one_pose:
+        return ALIGNED, nx, ny, nz, tan_gamma
+    one = 1.0 / sums[1]  # the voxel itself must lie on the plane of its region: no noise shells
+    own = (
+        nx * ((seen & 15) - sums[2] * one)
+        + ny * (((seen >> 4) & 15) - sums[3] * one)
+        + nz * (((seen >> 8) & 15) - sums[4] * one)
+    )
+    if tan_gamma > rule.tan_theta or abs(own) > rule.offset:
+        return THICK, nx, ny, nz, tan_gamma
+    return VALID, nx, ny, nz, tan_gamma
