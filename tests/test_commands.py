@@ -117,7 +117,13 @@ def test_what_is_left_out_is_counted(log: Path) -> None:
     scans = room(6)
     scans[2] = replace(scans[2], payload=b"\x01\x02")
     write_recording(log, scans, {})
-    assert "1 malformed" in facet("replay", log, "--voxel", 0.1, code=3)
+    text = facet("replay", log, "--voxel", 0.1, code=3)
+    assert "1 malformed" in text
+    last = "mapped 5 of 6 scans recorded (83.3 %), missing from the log 0"
+    assert text.splitlines()[-1] == last
+    del scans[3]
+    write_recording(log, scans, {})
+    assert "missing from the log 1" in facet("replay", log, "--voxel", 0.1, code=3)
 
 
 def test_info(log: Path, tmp_path: Path) -> None:
@@ -292,7 +298,8 @@ def test_run_play_stop_replay(log: Path, tmp_path: Path) -> None:
         service.process.kill()
         service.process.wait()
     assert code == 0, output
-    assert "recorded 6 of 6 received (100.0 %), lost upstream 0" in output
+    last = output.splitlines()[-1]
+    assert last == "recorded 6 of 6 received (100.0 %), lost upstream 0"
     model = json.loads((tmp_path / "log" / "model.json").read_text())
     assert hashes(facet("replay", tmp_path / "log")) == model["digest"]
     assert hashes(facet("replay", log, "--voxel", 0.1)) == model["digest"]

@@ -24,6 +24,7 @@ from facet.commands.terminal import Exit, InputError, err, existing, out, progre
 from facet.config import Config, load_config
 from facet.cuts import logged_cuts, timed_cuts
 from facet.outgoing import Outgoing
+from facet.sequences import SequenceLedger
 from facet.robots import admission_of, dialects_of, recorded_robots, says_poses
 from facet.sinks import Sink
 from facet.sources.naming import is_input, is_scan, source_of
@@ -47,6 +48,8 @@ class Replayed:
     account: Account
     wall_s: float
     log_s: float  # from the first message's log time to the last's
+    num_scans: int
+    num_missing: int  # scans that their sources have sent, by their numbers, and the log lacks
 
     @property
     def num_left_out(self) -> int:
@@ -116,20 +119,28 @@ def replay_log(
     pipeline.finish()
     for sink in sinks:
         sink.close()
-    return Replayed(mapper, recording, account, time.monotonic() - started, times.span_s)
+    wall_s = time.monotonic() - started
+    return Replayed(mapper, recording, account, wall_s, times.span_s, num, times.num_missing)
 
 
 class _LogTimes:
-    """First and last log time of what passes."""
+    """First and last log time of what passes, and the numbers that do not."""
 
     def __init__(self) -> None:
         self._first = self._last = 0
+        self._ledger = SequenceLedger()
 
     def watch(self, envelopes: Iterable[Envelope]) -> Iterator[Envelope]:
         for envelope in envelopes:
             self._first = self._first or envelope.received_ns
             self._last = max(self._last, envelope.received_ns)
+            if is_scan(envelope):
+                self._ledger.note(source_of(envelope), envelope.epoch, envelope.sequence)
             yield envelope
+
+    @property
+    def num_missing(self) -> int:
+        return sum(self._ledger.missing().values())
 
     @property
     def span_s(self) -> float:
@@ -276,6 +287,12 @@ def print_result(result: Replayed, model: Model) -> None:
     table("map", ("what", "value"), summary(model, result.wall_s, result.log_s))
     out.print(f"state   {model['digest']['state']}")
     out.print(f"derived {model['digest']['derived']}")
+    num, applied = result.num_scans, result.account["applied"]
+    share = 100.0 * applied / num if num else 100.0
+    out.print(
+        f"mapped {applied:,} of {num:,} scans recorded ({share:.1f} %), "
+        f"missing from the log {result.num_missing:,}"
+    )
 
 
 def summary(model: Model, wall_s: float, log_s: float) -> list[tuple[str, Any]]:

@@ -158,12 +158,12 @@ def _conclude(service: Service, model: Model | None) -> Exit:
     lost = received - recorded + account["lost_upstream"]
     share = 100.0 * recorded / received if received else 100.0
     table("counters", ("counter", "value"), account.counters().items())
+    for path in service.recorder.paths:
+        out.print(f"log    {path}")
     out.print(
         f"recorded {recorded:,} of {received:,} received ({share:.1f} %), "
         f"lost upstream {account['lost_upstream']:,}"
     )
-    for path in service.recorder.paths:
-        out.print(f"log    {path}")
     if service.fault is not None:
         return Exit.FAULT
     if account.failure:
