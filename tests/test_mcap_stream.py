@@ -327,7 +327,7 @@ def test_millions_of_tiny_messages_take_the_memory_of_one_chunk(tmp_path: Path) 
 
 @pytest.mark.parametrize(
     "data",
-    [b"", b"\x89MC", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" + HEAD.pack(1, 1 << 62)],
+    [b"", b"\x89MC", b"\x89MCAP0\r\n", b"\x89MCAP0\r\n" + HEAD.pack(1, 1 << 62), bytes(1000)],
 )
 def test_what_a_crash_leaves_of_a_new_file_is_damage_and_no_error(
     tmp_path: Path, data: bytes

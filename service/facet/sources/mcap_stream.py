@@ -139,10 +139,12 @@ class McapStream:
         if len(magic) < len(MAGIC) and MAGIC.startswith(magic):
             self.damage.add(0, len(magic), "the file is cut off before its first record")
             return self._size
-        found = find_chunk(file, 0, self._size)
-        if found is None:
+        if find_chunk(file, 0, self._size) is not None:
+            return (yield from self._salvage(file, 0, "the first magic is wrong"))
+        if any(magic):
             raise LogError(self.path, 0, "this is not an MCAP file")
-        return (yield from self._salvage(file, 0, "the first magic is wrong"))
+        self.damage.add(0, self._size, "its beginning was never written")  # in a power cut
+        return self._size
 
     def _record(self, file: BinaryIO, at: int) -> Reading:
         """Read the record at `at`."""
