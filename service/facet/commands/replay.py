@@ -24,8 +24,8 @@ from facet.commands.terminal import Exit, InputError, err, existing, out, progre
 from facet.config import Config, load_config
 from facet.cuts import logged_cuts, timed_cuts
 from facet.outgoing import Outgoing
-from facet.sequences import SequenceLedger
 from facet.robots import admission_of, dialects_of, recorded_robots, says_poses
+from facet.sequences import SequenceLedger
 from facet.sinks import Sink
 from facet.sources.naming import is_input, is_scan, source_of
 from facet.sources.recording import Recording, is_replayed, paced
