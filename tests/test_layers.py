@@ -32,7 +32,7 @@ EVERYTHING = Layer("facet.* facet_protocol.*", "*")
 SHELL = Layer(
     "facet facet.admission facet.config facet.frames facet.mapping.* facet.outgoing facet.pipeline "
     "facet.plausibility facet.resolution facet.sequences facet.sinks facet.sources.naming "
-    "facet.status facet_protocol.*"
+    "facet.standing facet.status facet_protocol.*"
 )
 WIRING = Layer(  # the threads of the running service: they join sources and sinks by hand
     f"{SHELL.ours} facet.intake facet.robots facet.session facet.sinks.* facet.sources.*"

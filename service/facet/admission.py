@@ -6,7 +6,7 @@ import hashlib
 import json
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
-from typing import NamedTuple, TypeGuard
+from typing import Any, NamedTuple, TypeGuard
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +22,7 @@ from facet.sources.naming import (
     pose_frame,
     source_of,
 )
+from facet.standing import freeze_resolution, thaw_resolution
 from facet.status import Account
 from facet_protocol.codec import decode
 from facet_protocol.messages import (
@@ -80,20 +81,22 @@ class Admission:
         for envelope in self._resolution.waiting():
             account.arrive(source_of(envelope))
 
-    def freeze(self) -> dict[str, NDArray[np.uint8]]:
+    def freeze(self) -> dict[str, NDArray[Any]]:
         """What it remembers, for a checkpoint."""
         ledger = json.dumps(self._applied.freeze(), sort_keys=True).encode()
         hashes = b"".join(sorted(self._unnumbered))
         return {
             "ledger": np.frombuffer(ledger, np.uint8),
             "unnumbered": np.frombuffer(hashes, np.uint8).reshape(-1, HASH_BYTES),
+            **freeze_resolution(self._resolution),
         }
 
-    def thaw(self, frozen: Mapping[str, NDArray[np.uint8]]) -> None:
+    def thaw(self, frozen: Mapping[str, NDArray[Any]]) -> None:
         """Remember what was frozen. Raises KeyError, TypeError, ValueError for anything else."""
         self._applied = SequenceLedger.thaw(json.loads(frozen["ledger"].tobytes()))
         hashes = frozen["unnumbered"].reshape(-1, HASH_BYTES)
         self._unnumbered = {row.tobytes() for row in hashes}
+        thaw_resolution(self._resolution, frozen, lambda e: self._decode(_inner(e)))
 
     def admit(self, envelope: Envelope) -> list[Admitted]:
         """The scans to insert: this one, or such as have waited for this pose. Often none."""
@@ -101,12 +104,7 @@ class Admission:
             return self._confirm(envelope)
         source = source_of(envelope)
         try:
-            rule = envelope.rule
-            if rule is not None and rule.envelope_field:
-                payload = unwrap(envelope.payload, rule.envelope_field)
-                inner = replace(envelope, payload=payload)
-            else:
-                inner = envelope
+            inner = _inner(envelope)
             if envelope.schema in TRANSFORM_SCHEMAS or envelope.schema in POSE_SCHEMAS:
                 return self._admit_pose(envelope, inner, source)
             return self._admit_scan(envelope, inner, source)
@@ -227,6 +225,14 @@ class Admission:
         known = digest.digest() in self._unnumbered
         self._unnumbered.add(digest.digest())
         return not known
+
+
+def _inner(envelope: Envelope) -> Envelope:
+    """Out of the envelope that a rule knows of. Raises ProtocolError."""
+    rule = envelope.rule
+    if rule is None or not rule.envelope_field:
+        return envelope
+    return replace(envelope, payload=unwrap(envelope.payload, rule.envelope_field))
 
 
 def _rank(envelope: Envelope) -> Rank:

@@ -7,6 +7,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Iterable
+from dataclasses import replace
 
 from facet.outgoing import Outgoing
 from facet.sequences import SequenceLedger
@@ -96,7 +97,9 @@ class Intake:
         self._commit_s, self._retry_s = commit_s, retry_s
         self._exit_on_failure = exit_on_failure
         self._ledger = SequenceLedger()
-        self._derived: deque[Envelope] = deque()
+        self._derived: deque[Envelope | threading.Event] = deque()
+        self._is_finished = False  # the log is whole, and nothing more comes
+        self._awaited: list[threading.Event] = []  # set when what was taken is durable
         self._scans: list[Envelope] = []  # written, not yet durable
         self._stopping = threading.Event()
         self._roll = threading.Event()
@@ -120,6 +123,14 @@ class Intake:
             self._derived.popleft()
             self._account.count("log_dropped")
         self._derived.append(envelope)
+
+    def is_logged(self, timeout_s: float) -> bool:
+        """Whether all that `write` has taken by now is durable, or is after so long."""
+        if self._is_finished:
+            return not self._derived
+        logged = threading.Event()
+        self._derived.append(logged)
+        return logged.wait(timeout_s)
 
     def close(self) -> None:
         """Nothing: the log is finished by `stop`, after the last message of every thread."""
@@ -172,11 +183,15 @@ class Intake:
             self._recorder.write(envelope)
             self._scans.append(envelope)
         while self._derived:
-            self._recorder.write(self._derived.popleft())
+            taken_next = self._derived.popleft()
+            if isinstance(taken_next, threading.Event):
+                self._awaited.append(taken_next)
+            else:
+                self._recorder.write(taken_next)
 
     def _note(self, envelope: Envelope) -> None:
         """What the number of one message tells: a gap before it, a restart, a late arrival."""
-        source = source_of(envelope.key)
+        source = source_of(envelope)
         noted = self._ledger.note(source, envelope.epoch, envelope.sequence)
         if noted.skipped:
             self._log_loss(loss_of(envelope, noted.first_skipped, noted.skipped, "lost_upstream"))
@@ -202,7 +217,11 @@ class Intake:
         source = f"{loss.robot}/{loss.sensor}"
         if loss.first_sequence:
             for sequence in range(loss.first_sequence, loss.first_sequence + loss.count):
-                self._ledger.note(source, loss.epoch, sequence)
+                noted = self._ledger.note(source, loss.epoch, sequence)
+                if noted.skipped:
+                    gap = replace(loss, first_sequence=noted.first_skipped, count=noted.skipped)
+                    self._log_loss(replace(gap, reason="lost_upstream"))
+            self._say_missing(source)
         self._log_loss(loss)
 
     def _write_loss(self, loss: Loss) -> None:
@@ -234,9 +253,11 @@ class Intake:
         self._hand_on()
 
     def _hand_on(self) -> None:
+        while self._awaited:
+            self._awaited.pop().set()
         scans, self._scans = self._scans, []
         for envelope in scans:
-            source = source_of(envelope.key)
+            source = source_of(envelope)
             self._account.count("recorded", source)
             self._account.gauge("ack", envelope.sequence, source)
         if scans:
@@ -254,9 +275,10 @@ class Intake:
         try:
             self._recorder.close()
             self._hand_on()
+            self._is_finished = True
         except OSError as error:
             lost = self._recorder.forget()
             self._account.failure = str(error)
             for envelope in self._scans:
-                self._account.settle(source_of(envelope.key), "unrecorded")
+                self._account.settle(source_of(envelope), "unrecorded")
             logger.error("%d messages could not be recorded: %s", len(lost), error)

@@ -94,6 +94,14 @@ class Outgoing:
     def loss(self, loss: Loss) -> Addressed:
         return self.address(topics.LOSS_TOPIC, loss, loss.stamp_ns, loss.stamp_ns)
 
+    def remember(self, snapshot: MapUpdate) -> None:
+        """The next scene shows all of it: a log that goes on in a new file."""
+        self._keep_for_scene(snapshot)
+
+    def snapshot(self, snapshot: MapUpdate, log_time_ns: int) -> Addressed:
+        """Everything, for those who follow and may have seen another map."""
+        return self.address(topics.UPDATE_TOPIC, snapshot, snapshot.stamp_ns, log_time_ns)
+
     def _keep_for_scene(self, update: MapUpdate) -> None:
         self._last = update
         for plane in update.changed:

@@ -8,6 +8,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from queue import SimpleQueue
@@ -17,16 +18,20 @@ import zenoh
 
 from facet import __version__
 from facet.admission import Admission
+from facet.checkpoint import Checkpoint
 from facet.config import Config
 from facet.export.formats import FORMATS
 from facet.export.model import Model, build_model
 from facet.intake import DurableQueue, Intake
+from facet.keeper import Keeper
 from facet.mapping.mapper import Mapper
 from facet.outgoing import Outgoing
 from facet.pipeline import Pipeline
+from facet.resume import Newest, Resumed, hold, note_newest
+from facet.robots import admission_of, dialects_of
 from facet.sinks.answers import Answers, CommandError
 from facet.sinks.publisher import Publisher
-from facet.sinks.recorder import Recorder
+from facet.sinks.recorder import LogPosition, Recorder
 from facet.sinks.snapshots import Snapshots
 from facet.sources.live import Inbox, LiveSource
 from facet.sources.naming import source_of
@@ -38,6 +43,10 @@ DRAIN_S = 1.0  # at the end: for what has come in to become durable
 LAST_UPDATE_S = 2.5  # at the end: no update starts later than this after `stop`
 JOIN_S = 5.0
 ANSWER_S = 10.0
+ACKNOWLEDGED = {
+    "durable": "on the disk: survives a power cut",
+    "fast": "with the system: survives the end of the service, no power cut",
+}
 
 
 @dataclass(slots=True)
@@ -51,8 +60,16 @@ class Task:
 class Service:
     """Everything between the Zenoh session and the map. `start`, then `stop`."""
 
-    def __init__(self, session: zenoh.Session, config: Config, mapper: Mapper) -> None:
+    def __init__(
+        self,
+        session: zenoh.Session,
+        config: Config,
+        mapper: Mapper,
+        resumed: Resumed | None = None,
+    ) -> None:
+        """`resumed` says where the mapper's log has come to; without it the map is new."""
         self.account = Account()
+        self._resumed = resumed
         self._session, self._config, self._mapper = session, config, mapper
         self._inbox = Inbox(
             config.queue.max_messages,
@@ -74,6 +91,8 @@ class Service:
             retry_s=config.record.retry_s,
             exit_on_failure=config.record.on_full == "exit",
         )
+        self._position: LogPosition | None = None  # all before it in the log is in the map
+        self._newest: Newest = {}
         self._tasks: SimpleQueue[Task] = SimpleQueue()
         self._running = threading.Event()  # cleared: paused
         self._running.set()
@@ -98,18 +117,47 @@ class Service:
             self._session, self._config.map.id, self._snapshots, self._commands()
         )
         every_ns = int(self._config.publish.points_s * 1e9) if self._config.publish.points else 0
+        self._admission = self._admit()
         self._pipeline = Pipeline(
             self._mapper,
-            Admission(self.account, self._config.map.frame, self._mapper.settings.reach_m),
+            self._admission,
             self.account,
             [self._intake, self._publisher],
             self._outgoing,
             every_ns,
         )
+        self._keeper = Keeper(self._config.record, self.account, self._intake.is_logged)
+        if self._resumed is not None:
+            self._go_on(self._resumed)
         self._intake.start()
         self._mapping.start()
         self._reporting.start()
-        self._source = LiveSource(self._session, self._config.map.id, self._inbox)
+        robots = self._config.robots
+        self._source = LiveSource(
+            self._session, self._config.map.id, self._inbox, dialects_of(robots), robots.keys
+        )
+
+    def _admit(self) -> Admission:
+        if self._resumed is None:
+            return admission_of(self._config, self.account, self._mapper.settings.reach_m)
+        self._resumed.admission.report_to(self.account)
+        return self._resumed.admission
+
+    def _go_on(self, resumed: Resumed) -> None:
+        """With a map that is there: clients get it whole, whatever they had seen of it."""
+        self._pipeline.take_over(resumed.pipeline)
+        self._pipeline.go_live()
+        self._position, self._newest = resumed.position, resumed.newest
+        self._intake.expect((source, *numbers) for source, numbers in resumed.newest.items())
+        self.account.gauge("resumed_scans", resumed.num_scans)
+        if not self._mapper.revision:
+            return
+        snapshot, log_time_ns = self._mapper.snapshot(), self._pipeline.log_time_ns
+        self._outgoing.remember(snapshot)
+        self._publisher.write(*self._outgoing.snapshot(snapshot, log_time_ns))
+        if self._config.publish.points:
+            for message in self._outgoing.points(self._mapper.points(), log_time_ns):
+                self._publisher.write(*message)
 
     def stop(self) -> Model | None:
         """Take no more scans, apply what is durable, finish the log; the model, if it can be made.
@@ -128,8 +176,16 @@ class Service:
         self._answers.close()
         self._publisher.close()
         self._intake.stop(JOIN_S)
-        finished = not self._mapping.is_alive() and self.fault is None
-        return self._model() if finished else None
+        if self._mapping.is_alive() or self.fault is not None:
+            return None
+        self._keep_last()
+        return self._model()
+
+    def _keep_last(self) -> None:
+        """The next start begins here; without it, it reads more of the log."""
+        if not self._pipeline.is_stale and self._position is not None:
+            with suppress(OSError):  # said and counted
+                self._keeper.save(self._hold(self._position))
 
     def _map(self) -> None:
         """The mapper's thread: all that is durable goes in, then an update, and again."""
@@ -150,11 +206,16 @@ class Service:
         if not self._running.wait(timeout_s):
             return
         started = time.monotonic()
+        is_whole = True
         for envelope in self._durable.take(timeout_s):
             if time.monotonic() > self._stop_at:
-                self.account.settle(source_of(envelope.key), "not_applied")
+                self.account.settle(source_of(envelope), "not_applied")
+                is_whole = False
                 continue
+            note_newest(self._newest, envelope)
             self._pipeline.insert(envelope)
+        if is_whole and self._durable.taken_to is not None:
+            self._position = self._durable.taken_to
         if self._pipeline.is_stale and time.monotonic() <= self._stop_at:
             self.account.stages({"insert": (time.monotonic() - started) * 1e3})
             update = self._pipeline.update()
@@ -162,6 +223,15 @@ class Service:
             self.account.gauge("update_ms", (time.monotonic() - started) * 1e3)
             self.account.gauge("map_lag_s", (time.time_ns() - self._pipeline.log_time_ns) * 1e-9)
             self.account.gauge("voxels", self._mapper.counts().voxels)
+        if self._position is not None and not self._pipeline.is_stale and self._keeper.is_due():
+            self._keeper.start(self._hold(self._position))
+
+    def _hold(self, position: LogPosition) -> Checkpoint:
+        """The map as it is now, on the thread that owns it."""
+        started = time.monotonic()
+        checkpoint = hold(self._mapper, self._admission, self._config, position, self._newest)
+        self.account.gauge("checkpoint_hold_ms", (time.monotonic() - started) * 1e3)
+        return checkpoint
 
     def _do(self, task: Task) -> None:
         try:
@@ -181,6 +251,8 @@ class Service:
         gauge = self.account.gauge
         gauge("queue_msgs", len(self._inbox) + len(self._durable))
         gauge("queue_bytes", self._inbox.num_bytes)
+        gauge("waiting_for_pose", self._admission.num_waiting)
+        gauge("foreign_ignored", self._inbox.num_ignored)
         gauge("recorded_bytes", self.recorder.committed_bytes)
         gauge("planes", self._snapshots.num_planes)
         gauge("disk_free_mb", self.recorder.free_bytes() / 1e6)
@@ -199,7 +271,7 @@ class Service:
             "resume": self._resume,
             "export": self._export,
             "record": self._record,
-            "checkpoint": _not_yet("there are no checkpoints: a map is rebuilt from its log"),
+            "checkpoint": self._checkpoint,
             "erase": _not_yet("scans are taken out by a correction, not by a command"),
         }
 
@@ -212,6 +284,22 @@ class Service:
     def _resume(self, parameters: Mapping[str, str]) -> Mapping[str, Any]:
         self._running.set()
         return {"paused": False}
+
+    def _checkpoint(self, parameters: Mapping[str, str]) -> Mapping[str, Any]:
+        """Now; the answer comes when it is on the disk."""
+
+        def now() -> Checkpoint:
+            if self._position is None:
+                raise CommandError("nothing has been mapped yet")
+            if self._pipeline.is_stale:
+                self._pipeline.update()
+            return self._hold(self._position)
+
+        try:
+            path, num_bytes = self._keeper.save(self._on_mapper(now))
+        except OSError as error:
+            raise CommandError(f"it cannot be written: {error}") from error
+        return {"path": str(path), "bytes": num_bytes, "revision": self._mapper.revision}
 
     def _record(self, parameters: Mapping[str, str]) -> Mapping[str, Any]:
         """A new file from the next commit on; the finished ones may be copied."""
@@ -249,11 +337,13 @@ def _recorder(config: Config, mapper: Mapper) -> Recorder:
     record = config.record
     metadata = {
         "cuts": "logged",
+        "resolved": "logged",
         "map": config.map.id,
         "frame": config.map.frame,
         "config": config.model_dump_json(exclude={"network"}),
         "settings": json.dumps(mapper.settings.as_dict()),
         "version": __version__,
+        "acknowledged": ACKNOWLEDGED[record.mode],
     }
     return Recorder(
         record.directory,
@@ -263,5 +353,6 @@ def _recorder(config: Config, mapper: Mapper) -> Recorder:
         max_file_bytes=record.max_file_bytes,
         max_file_ns=record.max_file_s * 10**9,
         min_free_bytes=record.min_free_bytes,
+        is_fast=record.mode == "fast",
         clock=time.time_ns,
     )

@@ -29,6 +29,8 @@ from facet.session import client_endpoint, open_session, service_settings
 
 if TYPE_CHECKING:
     from facet.export.model import Model
+    from facet.mapping.mapper import Mapper
+    from facet.resume import Resumed
     from facet.service import Service
 
 logger = logging.getLogger(__name__)
@@ -51,6 +53,12 @@ def run(
     on_full: Annotated[
         str | None, typer.Option(help="When the disk fails: retry | exit (with 74).")
     ] = None,
+    fast: Annotated[
+        bool, typer.Option("--fast", help="Do not wait for the disk: no power cut is survived.")
+    ] = False,
+    fresh: Annotated[
+        bool, typer.Option("--fresh", help="Begin a new map; its log so far is set aside.")
+    ] = False,
     voxel: VoxelOption = None,
     theta: ThetaOption = None,
     detail_level: DetailOption = None,
@@ -61,10 +69,13 @@ def run(
     facet run                                      # on tcp/127.0.0.1:7447, log in out/log
     facet run --viewer web                         # and a dashboard in the browser
     facet run --config facet.toml --map hall --record /data/hall
+    facet run --fresh                              # not going on with the map that is there
 
     Scans come in on facet/v1/<map>/robot/<robot>/scan/<sensor>. What is not in the log is not in
-    the map. At the end the log is finished and model.json lies beside it. Exit code 3: scans were
-    lost, the table says how many.
+    the map. A folder that holds this map's log is gone on with: from the last checkpoint, else from
+    the whole log, to the same map with the same ids; other settings than the log's are applied to
+    all of it. At the end the log is finished, with a checkpoint and model.json beside it. Exit
+    code 3: scans were lost, the table says how many.
     """
     set_up_logging()
     overrides = {
@@ -73,6 +84,8 @@ def run(
         "network.connect": connect or None,
         "record.directory": record,
         "record.on_full": on_full,
+        "record.mode": "fast" if fast else None,
+        "record.resume": False if fresh else None,
         "viewer": viewer,
         **mapping_overrides(voxel, theta, detail_level),
     }
@@ -82,16 +95,23 @@ def run(
 def serve(config: Config) -> Exit:
     """Run the service until a signal; the exit code."""
     from facet.export.model import write_model
-    from facet.service import Service
+    from facet.resume import Stopped
+    from facet.service import ACKNOWLEDGED, Service
     from facet.sinks.recorder import single_writer
     from facet.warmup import warm_up
 
     mapper = make_mapper(config)
     with single_writer(config.record.directory), stop_signals() as stop:
         warm_up(mapper.settings)
+        try:
+            resumed = _resume(config, mapper, stop)
+        except Stopped:
+            logger.warning("ended before the map was there again: its log is as it was")
+            return Exit.LOST
         with open_session(service_settings(config.network)) as session:
-            service = Service(session, config, mapper)
+            service = Service(session, config, resumed.mapper, resumed)
             service.start()
+            logger.info("acknowledged is what is %s", ACKNOWLEDGED[config.record.mode])
             logger.info("ready: map %s on %s", config.map.id, ", ".join(config.network.listen))
             try:
                 _watch(service, config, stop)
@@ -100,6 +120,17 @@ def serve(config: Config) -> Exit:
                 if model is not None:
                     write_model(model, config.record.directory / "model.json")
         return _conclude(service, model)
+
+
+def _resume(config: Config, mapper: Mapper, stop: threading.Event) -> Resumed:
+    """The map that is there, or with --fresh a new one, the other's log set aside."""
+    from facet.resume import resume, set_aside
+
+    if not config.record.resume:
+        folder = set_aside(config.record.directory, config.map.id)
+        if folder is not None:
+            logger.info("a new map; the log of the one before lies in %s", folder)
+    return resume(config, mapper, stop.is_set)
 
 
 @contextmanager

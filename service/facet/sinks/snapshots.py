@@ -42,6 +42,8 @@ class Snapshots:
         """Updates come in order and without gaps: from the one who makes them."""
         with self._lock:
             self._revision, self._stamp_ns = update.revision, update.stamp_ns
+            if update.base_revision == 0:  # what went before it is not known
+                self._forgotten = update.revision
             for plane in update.changed:
                 self._planes[plane.id] = (update.revision, plane)
                 self._retired.pop(plane.id, None)
