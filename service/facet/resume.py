@@ -138,7 +138,7 @@ def thaw_checkpoint(path: Path, settings: MapSettings | None = None) -> tuple[Ch
     try:
         settings = settings or MapSettings(**header["settings"])
         mapper = thaw(_part(checkpoint, MAP), settings, header["map"])
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, LookupError, AttributeError) as error:
         raise CheckpointError(path, f"it does not fit together ({error})") from error
     return checkpoint, mapper
 
@@ -204,7 +204,7 @@ def _from_checkpoint(
         channels = tuple(_channel_name(row) for row in log["channels"])
         resumed.position = LogPosition(str(log["file"]), int(log["offset"]), channels)
         resumed.newest = {source: (epoch, number) for source, epoch, number in header["newest"]}
-    except (ValueError, TypeError, KeyError) as error:
+    except (ValueError, TypeError, LookupError, AttributeError) as error:
         raise CheckpointError(path, f"it does not fit together ({error})") from error
     resumed.checkpoint = path
     return resumed

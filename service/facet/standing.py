@@ -87,6 +87,9 @@ def _thaw_frames(resolution: Resolution, text: Any, frozen: Arrays) -> None:
     stamps, samples = frozen["stamps"].tolist(), frozen["samples"].tolist()
     arrivals = frozen["arrivals"].tolist()
     lengths = frozen["lengths"].tolist()
+    totals = [len(stamps), len(samples), len(arrivals)]
+    if totals != [sum(n for n, _ in lengths)] * 2 + [sum(m for _, m in lengths)]:
+        raise ValueError(f"{len(lengths)} edges do not have {totals} stamps, samples, arrivals")
     at = at_arrival = 0
     for (robot, parent, child, rank, topic), (num, num_arrivals) in zip(
         text["edges"], lengths, strict=True

@@ -99,6 +99,7 @@ def cmd(
     facet cmd pause
     facet cmd export format=glb
     facet cmd record                 # start a new log file; the others can be copied
+    facet cmd checkpoint             # the next start goes on from here
     """
     try:
         selector = topics.cmd_key(map_id, name)
