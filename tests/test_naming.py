@@ -52,6 +52,7 @@ def test_a_pose_is_no_input_unless_something_says_of_what() -> None:
     native = Envelope("facet/v1/m/robot/r/pose/lidar", "foxglove.PoseInFrame", "protobuf", b"")
     assert is_input(native)
     assert pose_frame(native) == "lidar"
+    assert pose_frame(replace(native, key="facet/v1/m/robot/r/tf")) == ""
 
 
 def test_what_facet_derived_is_no_input() -> None:

@@ -66,7 +66,8 @@ def pose_frame(envelope: Envelope) -> str:
     if envelope.rule is not None and envelope.rule.frame:
         return envelope.rule.frame
     if topics.is_pose_key(envelope.key):
-        return topics.parse_pose_key(envelope.key)[1]
+        _, name = topics.parse_pose_key(envelope.key)
+        return name if envelope.key.endswith(f"/pose/{name}") else ""  # transforms name their own
     return ""
 
 
