@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 from collections.abc import Iterable
 from dataclasses import replace
@@ -31,10 +32,13 @@ SOURCE = "r1/lidar"
 class Line:
     """Everything behind the door, in one thread: recorded first, then applied."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, max_file_bytes: int = 1 << 30) -> None:
         self.account, self.mapper = Account(), Mapper(SETTINGS)
         self._folder = folder
-        self._recorder = Recorder(folder, "map", {}, clock=lambda: 10**18)
+        clock = itertools.count(10**18, 10**6)  # files are named by it
+        self._recorder = Recorder(
+            folder, "map", {}, max_file_bytes=max_file_bytes, clock=lambda: next(clock)
+        )
         self._pipeline = Pipeline(
             self.mapper,
             Admission(self.account, "map", SETTINGS.reach_m),

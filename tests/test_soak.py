@@ -28,6 +28,7 @@ from rig import START_NS
 
 LAP = Path(__file__).parents[1] / "recordings" / "office-pushbroom.mcap"
 ROBOTS, RATE_HZ, BATCH = 10, 40, 400
+FILE_BYTES = 32 << 20  # a file's index is kept until it is finished: files that are soon full
 PROCESS = psutil.Process()
 
 
@@ -86,7 +87,7 @@ def soak(
     folder: Path, robot_hours: float, payloads: list[bytes], laps_between: float = 0.5
 ) -> list[Mark]:
     """Drive; a mark every half lap after the first, at the same places of the floor."""
-    line, marks, num = Line(folder), list[Mark](), 0
+    line, marks, num = Line(folder, FILE_BYTES), list[Mark](), 0
     every = int(laps_between * len(payloads)) * ROBOTS
     for batch in drives(payloads):
         line.take(batch)

@@ -1,0 +1,125 @@
+"""Laws of the whole map that no module owns: rigid motion (P12), what sensors do (P13), and rest
+(P16, P18)."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import psutil
+import pytest
+
+from facet.mapping.digest import state_digest
+from facet.mapping.mapper import Mapper
+from facet_protocol.messages import Plane, Pose, Scan
+from mapping_logs import log, mapped
+from test_commands import Running
+
+LARGE = 5000  # points: a plane of fewer moves with every point that changes sides
+
+
+def quaternion_product(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    ax, ay, az, aw = a
+    bx, by, bz, bw = b
+    return np.array(
+        [
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+            aw * bw - ax * bx - ay * by - az * bz,
+        ]
+    )
+
+
+def moved(scan: Scan, motion: Pose) -> Scan:
+    turned = quaternion_product(motion.orientation_xyzw, scan.pose.orientation_xyzw)
+    position = motion.rotation() @ scan.pose.position + motion.position
+    return replace(scan, pose=Pose(position, turned / np.linalg.norm(turned)))
+
+
+def oriented(plane: Plane) -> tuple[np.ndarray, float]:
+    """Normal towards where it was seen from, and offset."""
+    return plane.normal * plane.facing, plane.d * plane.facing
+
+
+MOTIONS = {
+    "shifted": ((0.0, 0.0, 0.0, 1.0), (0.013, 0.021, -0.008)),
+    "turned": ((0.02, -0.01, 0.3, 0.95), (1.3, -2.1, 0.4)),
+}
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_p12_the_map_moves_with_the_robots(name: str) -> None:
+    """Other voxels hold the same points: about one in a hundred changes sides, and no large plane
+    moves by more than 1 mm or 5e-4 rad, a fifth of the noise. By whole tiles nothing changes at
+    all (test_exactness)."""
+    quaternion, shift = (np.array(v) for v in MOTIONS[name])
+    motion = Pose(shift, quaternion / np.linalg.norm(quaternion))
+    whole = log("room-lidar3d")
+    before = mapped(whole.scans, whole.settings).snapshot().changed
+    after = mapped([moved(s, motion) for s in whole.scans], whole.settings).snapshot().changed
+    large = [plane for plane in before if plane.num_points >= LARGE]
+    assert len(large) >= 5
+    for plane in large:
+        normal = motion.rotation() @ oriented(plane)[0]
+        centroid = motion.rotation() @ plane.centroid + shift
+        distances = []
+        for other in after:
+            n, d = oriented(other)
+            distances.append((float(np.linalg.norm(n - normal)), abs(float(n @ centroid) - d)))
+        turn, offset = min(distances)
+        assert turn < 5e-4, f"plane {plane.id} turned by {turn:.1e} rad"
+        assert offset < 1e-3, f"plane {plane.id} moved by {offset * 1e3:.2f} mm"
+
+
+def state(mapper: Mapper) -> str:
+    return state_digest(mapper._store, mapper._free)
+
+
+def test_p13_a_scan_in_two_halves_is_the_same_map() -> None:
+    whole = log("room-lidar3d")
+    halves = []
+    for scan in whole.scans:
+        middle, beams = len(scan.points) // 2, len(scan.no_return) // 2
+        halves += [
+            replace(scan, points=scan.points[:middle], no_return=scan.no_return[:beams]),
+            replace(scan, points=scan.points[middle:], no_return=scan.no_return[beams:]),
+        ]
+    one, two = mapped(whole.scans, whole.settings), mapped(halves, whole.settings)
+    assert one.digest() == two.digest()
+
+
+def test_p13_every_point_twice_is_the_same_planes() -> None:
+    whole = log("room-lidar3d")
+    twice = [replace(s, points=np.concatenate([s.points, s.points])) for s in whole.scans]
+    one, two = (mapped(s, whole.settings).snapshot().changed for s in (whole.scans, twice))
+    assert sorted(p.plane_class for p in one) == sorted(p.plane_class for p in two)
+    for plane in (p for p in one if p.num_points >= LARGE):
+        turn, other = min(
+            (float(np.linalg.norm(oriented(q)[0] - oriented(plane)[0])), q) for q in two
+            if abs(oriented(q)[1] - oriented(plane)[1]) < 0.05
+        )  # fmt: skip
+        assert turn < 1e-3
+        assert other.num_points == pytest.approx(2 * plane.num_points, rel=0.02)
+
+
+def test_p18_without_input_nothing_happens(tmp_path: Path) -> None:
+    """No processor time worth naming, no memory; of the file only its status once a second."""
+    service = Running(tmp_path / "log")
+    try:
+        process = psutil.Process(service.process.pid)
+        time.sleep(1.0)  # what a start leaves behind
+        cpu, rss = sum(process.cpu_times()[:2]), process.memory_info().rss
+        size = sum(p.stat().st_size for p in (tmp_path / "log").glob("*.mcap"))
+        time.sleep(4.0)  # the law is about time
+        used = sum(process.cpu_times()[:2]) - cpu
+        grown = sum(p.stat().st_size for p in (tmp_path / "log").glob("*.mcap")) - size
+        assert used <= 0.04, f"{used / 4.0:.1%} of a core"
+        assert process.memory_info().rss - rss < 1 << 20
+        assert grown < 4 * 2500
+        assert service.stop()[0] == 0
+    finally:
+        service.process.kill()
+        service.process.wait()
