@@ -14,10 +14,11 @@ import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any
 
-from facet import __version__
+from facet import __version__, mapping
 from facet.admission import Admission
 from facet.checkpoint import (
     Checkpoint,
@@ -78,10 +79,18 @@ class Resumed:
     num_scans: int = 0  # read from the log
 
 
+@cache
+def code() -> str:
+    """Hash of the mapping core as it is installed: an edit without a new version is another."""
+    files = sorted(Path(mapping.__path__[0]).glob("*.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()
+
+
 def origin(settings: MapSettings, config: Config) -> str:
     """Hash of all that decides, beside the log, what the map is."""
     parts = {
         "version": __version__,
+        "code": code(),
         "map": config.map.model_dump(mode="json"),
         "robots": config.robots.model_dump(mode="json"),
         "settings": settings.as_dict(),
