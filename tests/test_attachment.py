@@ -1,5 +1,6 @@
-"""The 24 bytes beside a scan."""
+"""What travels beside a scan: our 24 bytes, and what ROS 2 sends."""
 
+import struct
 from contextlib import suppress
 
 import pytest
@@ -7,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from facet_protocol import ProtocolError
-from facet_protocol.attachment import SIZE, Attachment, pack, unpack
+from facet_protocol.attachment import SIZE, Attachment, pack, unpack, unpack_ros
 
 
 def test_bytes_are_those_of_the_wire() -> None:
@@ -43,3 +44,34 @@ def test_other_bytes_are_refused(data: bytes) -> None:
     with pytest.raises(ProtocolError) as caught:
         unpack(data)
     assert caught.value.reason == "bad_attachment"
+
+
+GID = bytes(range(16))
+NAMES = (b"\x0fsequence_number", b"\x10source_timestamp", b"\x0asource_gid")
+
+
+@pytest.mark.parametrize("named", [True, False])
+@pytest.mark.parametrize("length", [b"\x10", b""])
+def test_every_layout_of_rmw_zenoh(named: bool, length: bytes) -> None:
+    values = [struct.pack("<q", 7), struct.pack("<q", 10**18), length + GID]
+    data = b"".join(n * named + v for n, v in zip(NAMES, values, strict=True))
+    mark = unpack_ros(data)
+    assert (mark.sequence, mark.stamp_ns) == (7, 10**18)
+    assert mark.epoch == unpack_ros(data).epoch > 0
+    other = unpack_ros(data[:-1] + b"x")
+    assert other.epoch != mark.epoch  # another publisher
+
+
+@given(st.binary(max_size=90))
+def test_other_bytes_are_not_rmw_zenohs(data: bytes) -> None:
+    try:
+        mark = unpack_ros(data)
+    except ProtocolError as error:
+        assert error.reason == "bad_attachment"
+    else:
+        assert mark.sequence >= 0
+
+
+def test_a_negative_sequence_is_refused() -> None:
+    with pytest.raises(ProtocolError, match="-1 is below 0"):
+        unpack_ros(struct.pack("<qq", -1, 0) + GID)
