@@ -137,4 +137,7 @@ def left_out(
 
 
 def scans_in(folder: Path) -> list[Envelope]:
+    """What a folder's logs hold by now; none while there is no log."""
+    if not list(folder.glob("*.mcap")):
+        return []
     return [e for e in Recording([folder]) if is_scan(e)]

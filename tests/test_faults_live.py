@@ -1,4 +1,4 @@
-"""Faults of a running service (F16, F19-F23, F26, F29, F30; G13, G15): its threads in this
+"""Faults of a running service (F19-F23, F26, F29, F30, F36; G13, G15): its threads in this
 process, robots over real sessions."""
 
 from __future__ import annotations
@@ -30,8 +30,9 @@ from facet.status import balance_of
 from facet_protocol import attachment, topics
 from facet_protocol.codec import decode
 from facet_protocol.messages import Loss, Status
-from fault_rig import SETTINGS, small_scan
+from fault_rig import SETTINGS, scans_in, small_scan
 from rig import START_NS, free_endpoint, scan_envelope, wait_until
+from test_commands import Running
 from test_service import break_disk, running, send
 
 PAYLOAD = bytes(scan_envelope(small_scan(1)).payload)
@@ -305,3 +306,26 @@ def test_g13_viewers_for_a_minute(tmp_path: Path) -> None:
     sys.stdout.write(f"G13: ack ms (median, 99 %): {found}\n")
     for name in ("running", "stopped", "killed"):
         assert found[name][1] <= found["none"][1] + 20.0, found
+
+
+@pytest.mark.parametrize(("number", "times"), [(signal.SIGTERM, 1), (signal.SIGINT, 2)])
+def test_f36_asked_to_stop(tmp_path: Path, number: int, times: int) -> None:
+    """Once: the file is finished, exit code 0, within five seconds. Twice: at once, like a kill;
+    what was acknowledged is there all the same."""
+    service = Running(tmp_path / "log")
+    try:
+        with open_session(client_settings(service.endpoint, shared_memory=False)) as client:
+            wait_for_ear(client)
+            for sequence in (1, 2, 3):
+                put(client, sequence)
+            wait_until(lambda: len(scans_in(service.folder)) == 3)
+        if times == 2:
+            service.process.send_signal(number)
+        code, _ = service.stop(number)
+    finally:
+        service.process.kill()
+        service.process.wait()
+    assert code == 0 if times == 1 else code in (0, 128 + number)
+    recording = Recording([service.folder])
+    assert [e.sequence for e in recording if e.key == KEY] == [1, 2, 3]
+    assert times == 2 or not recording.is_damaged
