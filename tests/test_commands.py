@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -293,6 +294,10 @@ def test_run_play_stop_replay(log: Path, tmp_path: Path) -> None:
         status = process("status", "--connect", service.endpoint)
         assert status.returncode == 0, status.stderr
         assert "[r1/lidar]" in status.stdout
+        said = " ".join(status.stdout.split())
+        law = re.search(r"received (\d+) = applied (\d+) \+ .* \+ in flight (\d+)", said)
+        assert law is not None
+        assert int(law[1]) == int(law[2]) + int(law[3])
         code, output = service.stop()
     finally:
         service.process.kill()

@@ -17,6 +17,7 @@ from rich.text import Text
 
 from facet.commands.terminal import Exit, InputError, err, out
 from facet.session import DEFAULT_ENDPOINT, client_settings, open_session
+from facet.status import balance_of
 from facet_protocol import topics
 from facet_protocol.messages import ProtocolError, Status
 from facet_protocol.records import decode_status
@@ -121,7 +122,13 @@ def cmd(
 
 
 def _table(current: Status) -> Table:
-    grid = Table(title=f"map {current.map_id}, revision {current.revision}: {current.health}")
+    balance = balance_of(current.counters, current.gauges)
+    grid = Table(
+        title=f"map {current.map_id}, revision {current.revision}: {current.health}",
+        caption=f"received {balance.received:,} = applied {balance.applied:,} + rejected "
+        f"{balance.rejected:,} + left out {balance.left_out:,} + in flight {balance.in_flight:,}; "
+        f"lost upstream {current.counters.get('lost_upstream', 0):,}",
+    )
     for column in ("counter", "value", "gauge", "value", "stage", "ms"):
         grid.add_column(column, justify="right" if column in ("value", "ms") else "left")
     columns = [
