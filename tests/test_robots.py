@@ -29,7 +29,7 @@ from facet.sources.naming import is_input
 from facet.sources.recording import Recording
 from facet_protocol import topics
 from facet_protocol.codec import decode
-from facet_protocol.messages import LineFan, ResolvedPose
+from facet_protocol.messages import LineFan, Pose, ResolvedPose
 from rig import room, room_scan, scan_envelope, service_and_client, wait_until
 
 SETTINGS = MapSettings(voxel_m=0.1)
@@ -205,6 +205,47 @@ def test_line_scans_as_a_rosbag2(tmp_path: Path) -> None:
     digest, result = map_of(ros.write_bag(tmp_path / "bag", messages()))
     assert digest == map_of(tmp_path / "native.mcap")[0]
     assert result.account["applied"] == 4
+
+
+def drive() -> Iterator[tuple[str, int, Any]]:
+    """A sensor mounted askew on a robot that turns; poses at their own stamps, two links of a chain
+    at different rates, scans between them."""
+    mount = Pose(np.array([0.2, -0.1, 0.4]), np.array([0.1, -0.7, 0.1, 0.7]))
+    start = room_scan(1).stamp_ns
+    yield "/tf_static", start, ros.transforms(ros.transform(0, "base", "lidar", mount))
+    for k in range(40):
+        stamp, angle = start + k * 17_000_000, 0.05 * k
+        turn = np.array([0.0, 0.0, np.sin(angle / 2), np.cos(angle / 2)])
+        pose = Pose(np.array([0.03 * k, -0.02 * k, 1.0]), turn)
+        yield "/odom", stamp, ros.odometry(stamp, "odom", "base", pose)
+        if k % 3 == 0:
+            drift = Pose(np.array([0.001 * k, 0.0, 0.0]), robots.STILL.orientation_xyzw)
+            yield "/tf", stamp, ros.transforms(ros.transform(stamp, "map", "odom", drift))
+        if k % 5 == 2:
+            scan_ns = stamp + 3_123_457
+            points = room_scan(k).points
+            yield "/points", scan_ns, ros.cloud(scan_ns, "lidar", points)
+
+
+def test_a_drive_with_poses_of_its_own_live_and_as_a_rosbag2(tmp_path: Path) -> None:
+    """Live, the replay of its log, and the recording of ROS 2 all resolve to the same bits."""
+    messages = list(drive())
+    digest, result = map_of(ros.write_bag(tmp_path / "bag", messages))
+    assert result.account["applied"] == 8
+    with running(tmp_path / "log") as (service, client):
+        service.start()
+        for topic, _, message in messages:
+            kind = f"application/cdr;{message.__msgtype__}"
+            put(client, [robots.Put(f"rt{topic}", ros.cdr(message), kind)])
+        wait_until(lambda: service.account["applied"] == 8, 60)
+        model = service.stop()
+    assert model is not None
+    assert model["digest"] == digest
+    assert map_of(tmp_path / "log")[0] == digest
+    poses = [decode(e) for e in Recording([tmp_path / "log"]) if e.key == topics.RESOLVED_TOPIC]
+    first = poses[0]
+    assert isinstance(first, ResolvedPose)
+    assert abs(np.linalg.norm(first.pose.orientation_xyzw) - 1.0) < 1e-15
 
 
 def test_scans_without_a_pose_are_refused_and_counted(tmp_path: Path) -> None:
