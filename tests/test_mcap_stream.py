@@ -18,10 +18,12 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from facet.sinks.log_file import write_recording
+from facet.sources.mcap_chunk import parse_chunk
 from facet.sources.mcap_stream import LogError, McapStream
 from facet_protocol.messages import Envelope
 
 HEAD = struct.Struct("<BQ")
+PARSE = parse_chunk
 SEED = 20
 
 
@@ -145,15 +147,31 @@ def check_flips(path: Path, log: Whole, bits: list[int]) -> int:
 @pytest.mark.parametrize("compression", ["lz4", "zstd", "none"])
 def test_cut_anywhere(tmp_path: Path, compression: str) -> None:
     log = whole_log(tmp_path / "a.mcap", 60, compression)
-    cuts = random.Random(SEED).sample(range(len(log.data)), 300)
+    cuts = random.Random(SEED).sample(range(len(log.data)), 200)
     check_cuts(tmp_path / "cut.mcap", log, [0, 1, 7, 8, 9, *cuts, len(log.data) - 1])
 
 
 @pytest.mark.parametrize("compression", ["lz4", "zstd", "none"])
 def test_one_bit_flipped(tmp_path: Path, compression: str) -> None:
     log = whole_log(tmp_path / "a.mcap", 60, compression)
-    bits = random.Random(SEED).sample(range(8 * len(log.data)), 400)
-    assert check_flips(tmp_path / "bit.mcap", log, bits) > 100
+    bits = random.Random(SEED).sample(range(8 * len(log.data)), 300)
+    assert check_flips(tmp_path / "bit.mcap", log, bits) > 80
+
+
+def test_without_its_checksum_a_chunk_is_believed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The mutant that the test above must kill: a reader that does not look at the CRC."""
+    log = whole_log(tmp_path / "a.mcap", 60, "none")
+    monkeypatch.setattr(
+        "facet.sources.mcap_chunk.parse_chunk", lambda content: PARSE(content)._replace(crc=0)
+    )
+    monkeypatch.setattr(
+        "facet.sources.mcap_stream.parse_chunk", lambda content: PARSE(content)._replace(crc=0)
+    )
+    bits = random.Random(SEED).sample(range(8 * len(log.data)), 100)
+    with pytest.raises(AssertionError, match="never written"):
+        check_flips(tmp_path / "bit.mcap", log, bits)
 
 
 @pytest.mark.parametrize("compression", ["lz4", "none"])

@@ -33,7 +33,7 @@ ALIGNMENT = 64
 MAX_HEADER_BYTES = 64 << 20
 _PREAMBLE = struct.Struct("<8sIIIIQ")
 _KINDS = "biufSU"  # of dtypes: plain numbers and fixed strings
-_PIECE = 16 << 20  # written and summed at a time
+_PIECE = 4 << 20  # on the disk at a time: a log on the same disk does not wait for all of it
 
 Arrays = Mapping[str, NDArray[Any]]
 
@@ -120,6 +120,8 @@ def _write(system: Any, fd: int, data: memoryview) -> int:
         if num_written <= 0:
             raise OSError("nothing could be written")
         num_bytes += num_written
+        if data.nbytes >= _PIECE:
+            system.fsync(fd)
     return num_bytes
 
 
