@@ -72,7 +72,12 @@ class RobotPublisher:
             self._session,
             key,
             congestion_control=zenoh.CongestionControl.BLOCK,
-            cache=zenoh.ext.CacheConfig(max_samples=num_kept),
+            cache=zenoh.ext.CacheConfig(
+                num_kept,
+                replies_config=zenoh.ext.RepliesConfig(
+                    congestion_control=zenoh.CongestionControl.BLOCK  # what is asked for arrives
+                ),
+            ),
             sample_miss_detection=zenoh.ext.MissDetectionConfig(
                 heartbeat=HEARTBEAT_S,
                 sporadic_heartbeat=None,  # also when it sends no more
