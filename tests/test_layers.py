@@ -45,6 +45,7 @@ LAYERS = {  # the longest name that fits counts
     "facet.mapping": Layer(
         "facet.mapping.* facet_protocol.messages", "numpy scipy numba llvmlite", pure=True
     ),
+    "facet.mapping.kernel": Layer("", "numba"),  # it names the cache of compiled loops
     "facet.sources": Layer("facet.sources.* facet_protocol.*", "numpy zenoh mcap lz4 zstandard"),
     "facet.sinks": Layer(
         "facet.sinks.* facet.export.* facet_protocol.*", "numpy zenoh mcap rerun rerun_cli"

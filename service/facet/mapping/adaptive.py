@@ -12,17 +12,18 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from facet.mapping.eigen import eigenvalues, eigenvector
 from facet.mapping.halo import take
+from facet.mapping.kernel import kernel
 from facet.mapping.region import MOST, covariance, decode, is_one_pose, shape, within, within_slab
 from facet.mapping.settings import STEPS, MapSettings
 
 EMPTY, VALID, ALIGNED, THICK, SPARSE, MIXED = range(6)
 WIDER = 255  # no class: the voxel must look farther than its halo
 UNIT = 256  # normals are integers: a unit vector times this
+OUTLIER = 6  # a voxel with so many times fewer points than those round it has no normal
 MIN_VOTES = 4  # fewer votes than this say nothing
 
 
@@ -45,6 +46,7 @@ class Rule(NamedTuple):
     start: int
     largest: int
     sparse: int
+    outlier: int
 
 
 def make_rule(settings: MapSettings) -> Rule:
@@ -74,10 +76,11 @@ def make_rule(settings: MapSettings) -> Rule:
         start=settings.start_radius,
         largest=settings.max_radius,
         sparse=MIN_VOTES,
+        outlier=OUTLIER,
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _step(sums, r, rule):  # type: ignore[no-untyped-def]
     """The next radius by eq. 16-20: at least one voxel up or down, at most double or half."""
     votes = min(sums[0], rule.growth.shape[0] - 1)
@@ -93,7 +96,7 @@ def _step(sums, r, rule):  # type: ignore[no-untyped-def]
     return min(rule.largest, max(1, r_next))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _find_radius(halo, margin, x, y, z, seen, rule, scratch):  # type: ignore[no-untyped-def]
     """Follow the radius until it repeats; of a cycle the smallest. (radius, reach, votes): reach is
     the largest radius that was looked at, and so far `votes` are listed; radius 0 where it would
@@ -121,7 +124,7 @@ def _find_radius(halo, margin, x, y, z, seen, rule, scratch):  # type: ignore[no
             decode(lists, count, seen, x + margin, y + margin, z + margin, votes)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def estimate(halo, margin, local, seen, rule, scratch):  # type: ignore[no-untyped-def]
     """(class, nx, ny, nz, gamma in half degrees, at a border, reach) of a voxel of the block that
     `halo` surrounds; class WIDER where the halo is too narrow to tell."""
@@ -136,8 +139,10 @@ def estimate(halo, margin, local, seen, rule, scratch):  # type: ignore[no-untyp
         return SPARSE, 0, 0, 0, 0, False, reach
     one_pose = seen >> 32 != 0 and is_one_pose(lists, votes, count, r)
     kind, nx, ny, nz, tan_gamma = _classify(sums, seen, one_pose, rule)
-    if kind == THICK and tan_gamma <= rule.tan_theta:  # beside a plane, not on it: a noise shell
-        return kind, 0, 0, 0, 255, False, reach
+    outlier = rule.outlier * ((seen >> 12) & 15) * sums[0] <= sums[1]  # of few points, among many
+    beside = kind == THICK and tan_gamma <= rule.tan_theta  # a plane, not on it: a noise shell
+    if kind != ALIGNED and (outlier or beside):
+        return THICK, 0, 0, 0, 255, False, reach
     cx, cy, cz = seen & 15, (seen >> 4) & 15, (seen >> 8) & 15
     first = (
         r  # radius of the region that gives the first normal: smaller where the full one is thick
@@ -172,7 +177,7 @@ def estimate(halo, margin, local, seen, rule, scratch):  # type: ignore[no-untyp
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _at_border(sums, seen, r, nx, ny, nz, rule):  # type: ignore[no-untyped-def]
     """Whether the votes lie to one side of the voxel, in the plane."""
     w = float(sums[1])
@@ -183,7 +188,7 @@ def _at_border(sums, seen, r, nx, ny, nz, rule):  # type: ignore[no-untyped-def]
     return (dx * dx + dy * dy + dz * dz) - along * along > (rule.border * r) ** 2
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _towards(seen, nx, ny, nz):  # type: ignore[no-untyped-def]
     """The normal along the view direction of the voxel with observable `seen`."""
     return (
@@ -193,7 +198,7 @@ def _towards(seen, nx, ny, nz):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _classify(sums, seen, one_pose, rule):  # type: ignore[no-untyped-def]
     """(class, normal towards the view, tan gamma) of the voxel with observable `seen`."""
     a, b, c, d, e, f = covariance(sums)

@@ -7,10 +7,10 @@ bevelled edge, they turn steadily. Whatever turns goes to the remainder (design 
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from facet.mapping.eigen import eigenvector, smallest
+from facet.mapping.kernel import kernel
 from facet.mapping.merging import Nodes
 from facet.mapping.normals import UNIT, NormalField
 from facet.mapping.patches import PatchField
@@ -21,7 +21,7 @@ from facet.mapping.tiles import TileField
 SUMS = 22  # n; sum x (3), xx (6); sum u (3), u x (9): x in 1/8 voxels, u normals times UNIT
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_members(rows, owner, corner, plane_of, voxels, observable, unit, pure, origin, sums):  # type: ignore[no-untyped-def]
     """Add a tile's pure members to the sums (K, SUMS) of their planes; plane_of (T,), -1: none."""
     x = np.empty(3, np.int64)

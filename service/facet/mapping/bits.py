@@ -6,8 +6,10 @@ from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.extending import intrinsic
+
+from facet.mapping.kernel import kernel
 
 
 def _trailing_zeros(typingctx: Any, word: Any) -> Any:
@@ -38,7 +40,7 @@ def _population(typingctx: Any, word: Any) -> Any:
 population: Any = intrinsic(_population)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def box_mask(x0: int, x1: int, y0: int, y1: int) -> np.uint64:
     """Bits x + 8 y with x0 <= x <= x1 and y0 <= y <= y1 (all 0..7)."""
     row = (np.uint64(1) << np.uint64(x1 + 1)) - (np.uint64(1) << np.uint64(x0))

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from facet.mapping.kernel import kernel
 
 Int64Array = NDArray[np.int64]
 
@@ -16,13 +17,13 @@ EMPTY = np.int64(-1)
 CENTRE = 13  # a block's own place among its 27 neighbours
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pack(i: int, j: int, k: int) -> int:
     """One sortable int64 from three indices in [-2^20, 2^20)."""
     return ((i + OFFSET) << 42) | ((j + OFFSET) << 21) | (k + OFFSET)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def unpack(key: int) -> tuple[int, int, int]:
     """The inverse of `pack`."""
     return (key >> 42) - OFFSET, ((key >> 21) & MASK) - OFFSET, (key & MASK) - OFFSET
@@ -41,7 +42,7 @@ def pack_all(ijk: Int64Array) -> Int64Array:
     return np.asarray((i << 42) | (j << 21) | k, dtype=np.int64)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def hash_key(key: Any) -> Any:
     """A 63-bit mix (splitmix64's finaliser)."""
     z = np.uint64(key)
@@ -50,7 +51,7 @@ def hash_key(key: Any) -> Any:
     return np.int64((z ^ (z >> np.uint64(31))) >> np.uint64(1))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def find(table_keys: Int64Array, table_values: NDArray[np.int32], key: Any) -> Any:
     """The value stored under `key`, or -1. Table size is a power of two, never full."""
     mask = table_keys.shape[0] - 1
@@ -63,7 +64,7 @@ def find(table_keys: Int64Array, table_values: NDArray[np.int32], key: Any) -> A
         slot = (slot + 1) & mask
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def put(table_keys: Int64Array, table_values: NDArray[np.int32], key: int, value: int) -> None:
     """Store a key that is not in the table yet."""
     mask = table_keys.shape[0] - 1
@@ -74,7 +75,7 @@ def put(table_keys: Int64Array, table_values: NDArray[np.int32], key: int, value
     table_values[slot] = value
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def rehash(keys: Int64Array, count: int, size: int) -> tuple[Int64Array, NDArray[np.int32]]:
     """A table of `size` slots that maps keys[b] to b."""
     table_keys = np.full(size, EMPTY, np.int64)
@@ -95,7 +96,7 @@ class Blocks(NamedTuple):
     neighbours: NDArray[np.int32]  # (B, 27) at (dx+1) + 3 (dy+1) + 9 (dz+1), -1: none
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def add_block(blocks: Blocks, count: int, key: int) -> int:
     """Append the block `key` as number `count` and link it with its neighbours. Returns `count`."""
     blocks.keys[count] = key

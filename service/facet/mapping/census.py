@@ -6,11 +6,11 @@ from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from facet.mapping.bits import trailing_zeros
 from facet.mapping.blocks import CENTRE, unpack
+from facet.mapping.kernel import kernel
 from facet.mapping.normals import ALIGNED, MIXED, SPARSE, THICK, VALID, Normals
 from facet.mapping.patches import Patches
 from facet.mapping.quantise import Ticks
@@ -80,7 +80,7 @@ class Census:
         )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fill(blocks, observable, label, id_of_patch, which, tile, centroids, ids):  # type: ignore[no-untyped-def]
     count = 0
     for q in range(which.shape[0]):

@@ -7,9 +7,10 @@ its fate. A voxel at a corner lies on two planes: the second may use it as a ver
 from __future__ import annotations
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from facet.mapping.blocks import CENTRE, find, pack, unpack
+from facet.mapping.kernel import kernel
 
 LEFTOVER_REACH = 8  # voxels between a leftover and the box of the patch it joins
 CLAIM_REACH = 2  # voxels between a corner voxel and the box of a patch that claims it too
@@ -19,7 +20,7 @@ CHUNK = 16  # blocks that a thread takes at a time
 CORNER_COS = 0.8  # planes that share a corner voxel differ by more than 37 degrees
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_candidates(patches, other, code, shift, tolerance, count, codes, planes, boxes):  # type: ignore[no-untyped-def]
     """Append the patches of block `other` whose plane comes within `tolerance` of the block that
     asks: label, plane (unit normal, offset, weight of its size) and box, in eighths from the corner
@@ -51,7 +52,7 @@ def _add_candidates(patches, other, code, shift, tolerance, count, codes, planes
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _near_candidates(blocks, patches, block, tolerance, codes, planes, boxes):  # type: ignore[no-untyped-def]
     """Patches of a block and its 26 neighbours."""
     count = 0
@@ -65,7 +66,7 @@ def _near_candidates(blocks, patches, block, tolerance, codes, planes, boxes):  
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _far_candidates(blocks, patches, block, tolerance, count, codes, planes, boxes):  # type: ignore[no-untyped-def]
     """Append the patches of the blocks two away: the other jamb of a door."""
     i, j, k = unpack(blocks.keys[block])
@@ -82,7 +83,7 @@ def _far_candidates(blocks, patches, block, tolerance, count, codes, planes, box
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _place(local, seen):  # type: ignore[no-untyped-def]
     """A voxel's rounded centroid, eighths from the block corner."""
     return (
@@ -92,18 +93,18 @@ def _place(local, seen):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _off(planes, q, c):  # type: ignore[no-untyped-def]
     """Distance of a place from a candidate's plane."""
     return abs(planes[q, 0] * c[0] + planes[q, 1] * c[1] + planes[q, 2] * c[2] - planes[q, 3])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _dot(planes, q, o):  # type: ignore[no-untyped-def]
     return planes[q, 0] * planes[o, 0] + planes[q, 1] * planes[o, 1] + planes[q, 2] * planes[o, 2]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _beside(boxes, q, c, axis):  # type: ignore[no-untyped-def]
     """Signed way from a place to a candidate's box along an axis; 0 within it."""
     if c[axis] < boxes[q, axis]:
@@ -111,7 +112,7 @@ def _beside(boxes, q, c, axis):  # type: ignore[no-untyped-def]
     return min(0, boxes[q, axis + 3] - c[axis])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gap(boxes, q, c):  # type: ignore[no-untyped-def]
     """Chebyshev distance of a place from a candidate's box."""
     return max(
@@ -119,7 +120,7 @@ def _gap(boxes, q, c):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join(planes, boxes, count, local, seen, tolerance):  # type: ignore[no-untyped-def]
     """Candidate that a leftover joins, -1: none. It must face the voxel's sensor, its plane must
     be near, and so must its box."""
@@ -142,7 +143,7 @@ def _join(planes, boxes, count, local, seen, tolerance):  # type: ignore[no-unty
     return best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _bridged(planes, boxes, count, q, c, tolerance):  # type: ignore[no-untyped-def]
     """Whether a place lies between candidate q and another of the same plane: on a threshold."""
     x, y, z = _beside(boxes, q, c, 0), _beside(boxes, q, c, 1), _beside(boxes, q, c, 2)
@@ -157,7 +158,7 @@ def _bridged(planes, boxes, count, q, c, tolerance):  # type: ignore[no-untyped-
     return False
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _claim(planes, boxes, near, count, c, tolerance, own):  # type: ignore[no-untyped-def]
     """Candidate of the first `near`, at an angle to `own`, that claims a place as a corner, or as
     a threshold with the help of any of the `count`.
@@ -180,7 +181,7 @@ def _claim(planes, boxes, near, count, c, tolerance, own):  # type: ignore[no-un
     return best, alone
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _flat(planes, count):  # type: ignore[no-untyped-def]
     """Whether all candidates look the same way: then there is no corner."""
     for q in range(1, count):  # noqa: SIM110 numba has no all() of a generator
@@ -189,7 +190,7 @@ def _flat(planes, count):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def label_blocks(blocks, observable, patches, which, tolerance, changed):  # type: ignore[no-untyped-def]
     """Label every voxel of the blocks `which` again; mark the blocks where a label changed.
 
@@ -207,7 +208,7 @@ def label_blocks(blocks, observable, patches, which, tolerance, changed):  # typ
             )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _label_block(blocks, observable, patches, block, tolerance, codes, planes, boxes):  # type: ignore[no-untyped-def]
     """Label the voxels of one block. Whether a label changed."""
     changed, far = False, False

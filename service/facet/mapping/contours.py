@@ -5,10 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from facet.mapping.blocks import unpack
+from facet.mapping.kernel import kernel
 from facet.mapping.pivot import CELLS, HALO, SIDE, boundary_edges, mark_changes
 from facet.mapping.rings import Outline, surfaces_of
 from facet.mapping.settings import STEPS, MapSettings
@@ -38,7 +38,7 @@ def make_frame(rounded: UnitNormal, voxel_m: float) -> PlaneFrame:
     return PlaneFrame(axis_u=u, axis_v=np.cross(n, u), axis_n=n, step_m=voxel_m / STEPS)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _project(rows, blocks, block_of, local_of, observable, axis_u, axis_v, out):  # type: ignore[no-untyped-def]
     """(u, v) in grid units of voxels."""
     for m in range(rows.shape[0]):
@@ -53,7 +53,7 @@ def _project(rows, blocks, block_of, local_of, observable, axis_u, axis_v, out):
         out[m, 1] = np.floor(x * axis_v[0] + y * axis_v[1] + z * axis_v[2] + 0.5)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _paint(points, tile_u, tile_v, cells):  # type: ignore[no-untyped-def]
     """Set the bits of the points (N, 2) that lie in a (u, v) tile."""
     for p in range(points.shape[0]):
@@ -63,7 +63,7 @@ def _paint(points, tile_u, tile_v, cells):  # type: ignore[no-untyped-def]
             cells[v >> 3, u >> 3] |= bit
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _places(points):  # type: ignore[no-untyped-def]
     """(u, v) tiles that points (N, 2) fall into, as tile_u * 2^32 + tile_v, each once."""
     seen = np.empty(64, np.int64)

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from facet.mapping.blocks import Int64Array, find, hash_key, pack, put, rehash, unpack
+from facet.mapping.kernel import kernel
 from facet.mapping.quantise import Ticks
 from facet.mapping.settings import TICKS
 
@@ -18,7 +18,7 @@ FIRST_BLOCKS = 1024  # capacity to begin with
 assert 1 << SHIFT == CELL * TICKS
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _count(table, counts, keys, num_blocks, i, j, k, sign):  # type: ignore[no-untyped-def]
     """Add `sign` to a cell; returns the number of blocks."""
     key = pack(i >> 3, j >> 3, k >> 3)
@@ -32,7 +32,7 @@ def _count(table, counts, keys, num_blocks, i, j, k, sign):  # type: ignore[no-u
     return num_blocks
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pass(table, counts, keys, num_blocks, a, b, sign, ends):  # type: ignore[no-untyped-def]
     """Count a beam from a to b (ticks) in every cell it passes; the last one only if nothing is
     there (`ends` false). Amanatides & Woo 1987, in integers."""
@@ -64,7 +64,7 @@ def _pass(table, counts, keys, num_blocks, a, b, sign, ends):  # type: ignore[no
     return num_blocks
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _blocks_apart(a, b):  # type: ignore[no-untyped-def]
     """Blocks between two points (ticks), axis by axis."""
     shift = SHIFT + 3
@@ -74,7 +74,7 @@ def _blocks_apart(a, b):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pass_all(table, counts, keys, num_blocks, sensor, points, start, every, sign, ends):  # type: ignore[no-untyped-def]
     """Follow the chosen beams from `start` on. Returns (next beam, number of blocks)."""
     for p in range(start, points.shape[0]):
@@ -90,7 +90,7 @@ def _pass_all(table, counts, keys, num_blocks, sensor, points, start, every, sig
     return points.shape[0], num_blocks
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def passed(table_keys, table_values, counts, points, least):  # type: ignore[no-untyped-def]
     """(N,) whether the cell of each point (N, 3) ticks was passed by at least `least` beams."""
     out = np.zeros(points.shape[0], np.bool_)
@@ -165,7 +165,7 @@ class FreeSpace:
         self._table = rehash(keys, self.num_blocks, 4 << (capacity - 1).bit_length())
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cell_keys(block_keys, block, local, out):  # type: ignore[no-untyped-def]
     for c in range(block.shape[0]):
         i, j, k = unpack(block_keys[block[c]])

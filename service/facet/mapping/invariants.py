@@ -7,11 +7,11 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from facet.mapping.blocks import CENTRE, find, pack_all, unpack, unpack_all
 from facet.mapping.digest import derived_digest, model_planes
+from facet.mapping.kernel import kernel
 from facet.mapping.normals import EMPTY, VALID
 from facet.mapping.planes import FREE
 from facet.mapping.quantise import VIEW
@@ -90,7 +90,7 @@ def check_moments(store: VoxelStore) -> None:
         assert np.all(poses[:, 0] * poses[:, 2] >= poses[:, 1] ** 2), "pose sums of no poses"
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _observe_all(moments, views, poses, count):  # type: ignore[no-untyped-def]
     out = np.empty(count, np.int64)
     none = poses[:0].reshape(-1)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from facet.mapping.bits import trailing_zeros
 from facet.mapping.blocks import CENTRE, find, pack, unpack
+from facet.mapping.kernel import kernel
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def collect(blocks, patches, plane_of_patch, tile_key, which, rows, owner, corner):  # type: ignore[no-untyped-def]
     """Voxels of the blocks `which` whose patch, own or claiming, lies in the tile. How many."""
     ti, tj, tk = unpack(tile_key)
@@ -39,7 +39,7 @@ def collect(blocks, patches, plane_of_patch, tile_key, which, rows, owner, corne
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def shell(table_keys, table_values, tile_key, out):  # type: ignore[no-untyped-def]
     """Existing blocks of a tile and of the one-block shell round it, by ascending key."""
     ti, tj, tk = unpack(tile_key)
@@ -54,7 +54,7 @@ def shell(table_keys, table_values, tile_key, out):  # type: ignore[no-untyped-d
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def inherit(old_rows, old_owner, old_corner, rows, owner, corner, scratch, counts):  # type: ignore[no-untyped-def]
     """counts[old, new]: voxels that went from one tile-plane to another. scratch (V,) stays 0."""
     for m in range(old_rows.shape[0]):

@@ -11,10 +11,10 @@ import math
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from facet.mapping.eigen import smallest
+from facet.mapping.kernel import kernel
 from facet.mapping.settings import MapSettings
 
 TRUSTED = 30  # below this many voxels the mean normal is trusted more than the fit
@@ -55,7 +55,7 @@ def limits(settings: MapSettings, sigma: float, angle_deg: float | None = None) 
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def plane_of(votes, scatter, unit):  # type: ignore[no-untyped-def]
     """(nx, ny, nz, variance along it, variance across it) of a node: the fit, or the mean normal of
     a small one. Across: the smaller of the two principal variances in the plane."""
@@ -74,7 +74,7 @@ def plane_of(votes, scatter, unit):  # type: ignore[no-untyped-def]
     return nx, ny, nz, max(0.0, spread) / votes, 0.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def pool(va, ma, sa, vb, mb, sb, mean, scatter):  # type: ignore[no-untyped-def]
     """P1, P2: mean and scatter of the union, into the last two (Chan, Golub & LeVeque 1979)."""
     total = va + vb
@@ -91,7 +91,7 @@ def pool(va, ma, sa, vb, mb, sb, mean, scatter):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _offset(normals, mean, a, b):  # type: ignore[no-untyped-def]
     """Signed distance of b's centroid from a's plane."""
     return (
@@ -101,7 +101,7 @@ def _offset(normals, mean, a, b):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _dot(normals, a, b):  # type: ignore[no-untyped-def]
     return (
         normals[a, 0] * normals[b, 0]
@@ -110,7 +110,7 @@ def _dot(normals, a, b):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def edge_costs(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-def]
     """(E,) cost of merging along each edge; inf where its two ends disagree by themselves."""
     normals = np.empty((votes.shape[0], 3))
@@ -131,7 +131,7 @@ def edge_costs(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-unt
     return costs
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _root(parent, t):  # type: ignore[no-untyped-def]
     while parent[t] != t:
         parent[t] = parent[parent[t]]
@@ -139,7 +139,7 @@ def _root(parent, t):  # type: ignore[no-untyped-def]
     return t
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _try(votes, mean, scatter, unit, normals, a, b, limit, m, s, u):  # type: ignore[no-untyped-def]
     """Whether a and b (a the larger) are one plane; m, s, u are then its statistics."""
     if _dot(normals, a, b) < limit.cos:
@@ -166,14 +166,14 @@ def _try(votes, mean, scatter, unit, normals, a, b, limit, m, s, u):  # type: ig
     return _agreement(nx, ny, nz, u) >= allowed
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _agreement(nx, ny, nz, unit):  # type: ignore[no-untyped-def]
     """Cosine between a normal and the mean of the members' normals."""
     length = np.sqrt(unit[0] * unit[0] + unit[1] * unit[1] + unit[2] * unit[2])
     return (nx * unit[0] + ny * unit[1] + nz * unit[2]) / length
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def merge(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-def]
     """Merge nodes along edges (E, 2), given best first. The four statistics end as those of the
     merged nodes, at the root's row. Returns (T,) the root of each node: its smallest member."""

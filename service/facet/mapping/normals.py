@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from facet.mapping.adaptive import (
@@ -22,6 +22,7 @@ from facet.mapping.adaptive import (
 )
 from facet.mapping.bits import trailing_zeros
 from facet.mapping.halo import LISTS, Halo, gather, make_halos
+from facet.mapping.kernel import kernel
 from facet.mapping.region import COLUMNS, MOST, SUMS
 from facet.mapping.settings import MapSettings
 from facet.mapping.staleness import find_candidates, find_stale, mark_dirty
@@ -43,7 +44,7 @@ class Normals(NamedTuple):
     reach: NDArray[np.uint8]  # largest radius that was looked at, voxels
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _estimate_row(halo, margin, observable, normals, row, local, rule, scratch):  # type: ignore[no-untyped-def]
     """Estimate one row and write it. SAME, CHANGED, or WIDER where nothing was written."""
     seen = observable[row]
@@ -67,7 +68,7 @@ def _estimate_row(halo, margin, observable, normals, row, local, rule, scratch):
     return CHANGED if changed else SAME
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _estimate_block(blocks, observable, normals, block, stale, rule, halo, scratch):  # type: ignore[no-untyped-def]
     """Estimate the voxels of a block whose bit is set in stale (8,), which comes back clear.
     Whether any changed. Few need to look far: the wider halos are gathered for them alone."""
@@ -92,7 +93,7 @@ def _estimate_block(blocks, observable, normals, block, stale, rule, halo, scrat
     return turned
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _deepest(blocks, reach, block):  # type: ignore[no-untyped-def]
     """The largest reach of a block's voxels."""
     largest = np.uint8(0)
@@ -103,7 +104,7 @@ def _deepest(blocks, reach, block):  # type: ignore[no-untyped-def]
     return largest
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _refresh(blocks, columns, normals, deepest, dirty, which, rule, halos, counts, turned):  # type: ignore[no-untyped-def]
     """Estimate again what is stale in the blocks `which` (C,); counts (C,) says how many voxels,
     turned (C,) whether any of them changed.

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from facet.mapping.freespace import CELL, FreeSpace
+from facet.mapping.kernel import kernel
 from facet.mapping.rings import inside
 from facet.mapping.settings import STEPS, TICKS, MapSettings
 from facet_protocol.messages import HoleKind, PlaneFrame
@@ -14,7 +14,7 @@ from facet_protocol.messages import HoleKind, PlaneFrame
 PITCH = CELL * STEPS // 2  # grid units between samples of a hole: half a cell
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _samples(ring, pitch):  # type: ignore[no-untyped-def]
     """(N, 2) points of the given pitch inside a ring."""
     low_u, high_u = ring[:, 0].min(), ring[:, 0].max()

@@ -10,13 +10,13 @@ import math
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from facet.mapping.bits import trailing_zeros
 from facet.mapping.blocks import CENTRE
 from facet.mapping.claims import label_blocks
 from facet.mapping.eigen import smallest
+from facet.mapping.kernel import kernel
 from facet.mapping.normals import VALID, Normals
 from facet.mapping.settings import STEPS, MapSettings
 from facet.mapping.store import MOMENTS, VoxelStore, shift_moments
@@ -76,7 +76,7 @@ def empty_patches() -> Patches:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _join(votes, centroid, unit, count, c, n, grouping):  # type: ignore[no-untyped-def]
     """Index of the patch that takes a voxel at c (eighths) with normal n; -1: none."""
     best, best_cost = -1, 2.0
@@ -98,7 +98,7 @@ def _join(votes, centroid, unit, count, c, n, grouping):  # type: ignore[no-unty
     return best
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _group(blocks, observable, normals, patches, block, grouping, scratch):  # type: ignore[no-untyped-def]
     """Group a block's valid voxels, best thickness angle first. Returns how many patches."""
     votes, centroid, scatter, unit, box, label = scratch
@@ -155,7 +155,7 @@ def _group(blocks, observable, normals, patches, block, grouping, scratch):  # t
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _store(blocks, patches, block, count, scratch):  # type: ignore[no-untyped-def]
     """Write a block's grouping. Returns whether it differs from what was there."""
     votes, centroid, scatter, unit, box, label = scratch
@@ -189,7 +189,7 @@ def _store(blocks, patches, block, count, scratch):  # type: ignore[no-untyped-d
     return changed
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _group_blocks(blocks, observable, normals, patches, which, grouping, changed):  # type: ignore[no-untyped-def]
     scratch = (
         np.zeros(PER_BLOCK, np.int64),
@@ -204,7 +204,7 @@ def _group_blocks(blocks, observable, normals, patches, which, grouping, changed
         changed[q] = _store(blocks, patches, which[q], count, scratch)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_points(blocks, moments, border, patches, block, pure, m, total):  # type: ignore[no-untyped-def]
     """Sum the members' point moments about the block corner into m (PER_BLOCK, 10): of all, or
     only of `pure` ones: not at a border, and claimed by no plane at an angle. Count the points of
@@ -226,7 +226,7 @@ def _add_points(blocks, moments, border, patches, block, pure, m, total):  # typ
                 shift_moments(moments[row], bit & 7, bit >> 3, z, m[p])
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _variance(m):  # type: ignore[no-untyped-def]
     """Smallest principal variance of point moments."""
     spread = np.empty(6)
@@ -239,7 +239,7 @@ def _variance(m):  # type: ignore[no-untyped-def]
     return smallest(spread)[0]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _sum_points(blocks, moments, border, patches, which, rungs, histogram):  # type: ignore[no-untyped-def]
     """Point moments and the rung of sigma_N. Corner voxels hold points of two planes: they are
     left out where enough others are there."""
@@ -270,7 +270,7 @@ def _sum_points(blocks, moments, border, patches, which, rungs, histogram):  # t
             histogram[rung] += patches.votes[block, p]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _dilate(blocks, which, flags, out):  # type: ignore[no-untyped-def]
     """Each of the blocks and of their 26 neighbours, once. Returns how many."""
     count = 0

@@ -12,10 +12,11 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from facet.mapping.bits import trailing_zeros
+from facet.mapping.kernel import kernel
 from facet.mapping.settings import ALPHA2
 
 CELLS = 64  # cells of a (u, v) tile's edge; a cell is one voxel, 8 x 8 grid points, one word
@@ -47,7 +48,7 @@ def _tables() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int6
 _BEGIN, _LENGTH, _AROUND = _tables()
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _cut(gaps, ends, count, begin, length, q):  # type: ignore[no-untyped-def]
     """Take the open arc [begin, begin + length) out of the gaps (start, stop); ends holds the
     points that bound each gap. Returns how many gaps are left."""
@@ -81,7 +82,7 @@ def _cut(gaps, ends, count, begin, length, q):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _surrounded(window, row, column):  # type: ignore[no-untyped-def]
     """Whether the eight cells round a cell all hold points. Then no point in it is on the boundary:
     whichever way the disc lies, it swallows one of these cells whole."""
@@ -92,7 +93,7 @@ def _surrounded(window, row, column):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mark_changes(old, new, near):  # type: ignore[no-untyped-def]
     """Mark in near (SIDE, SIDE) the cells, of a tile and of its halo, whose points may have other
     edges now that the tile's cells are `new`, not `old`. Whether there are any.
@@ -118,7 +119,7 @@ def mark_changes(old, new, near):  # type: ignore[no-untyped-def]
     return found
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _roll(window, wanted, begin, length, around, edges):  # type: ignore[no-untyped-def]
     """Edges (u, v, u', v') that start in the wanted cells (CELLS, CELLS) of the window's middle
     tile, grid units from the tile's corner. Returns how many, or -1 where `edges` is too short."""
@@ -167,7 +168,7 @@ def _roll(window, wanted, begin, length, around, edges):  # type: ignore[no-unty
     return num
 
 
-@njit(cache=True, nogil=True, parallel=True)
+@kernel(parallel=True)
 def _roll_all(windows, wanted, begin, length, around, edges, counts):  # type: ignore[no-untyped-def]
     for n in prange(windows.shape[0]):
         counts[n] = _roll(windows[n], wanted[n], begin, length, around, edges[n])

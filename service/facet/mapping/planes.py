@@ -12,10 +12,10 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from facet.mapping.blocks import unpack_all
+from facet.mapping.kernel import kernel
 from facet.mapping.merging import Limits, Nodes, merge_nodes, plane_of, pool
 from facet.mapping.settings import TICKS, TILE, MapSettings
 from facet.mapping.tiles import Tile
@@ -172,7 +172,7 @@ def _average_sigma(nodes: Nodes) -> float:
     return float(np.average(sigmas, weights=nodes.votes))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _fits(votes, mean, scatter, unit, t, normal, centre, limit):  # type: ignore[no-untyped-def]
     """RMS distance of a node's voxels to a plane, or -1 where it does not belong there."""
     u = unit[t]
@@ -193,7 +193,7 @@ def _fits(votes, mean, scatter, unit, t, normal, centre, limit):  # type: ignore
     return rms if rms <= limit.offset else -1.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _adopt_along(votes, mean, scatter, unit, edges, label, normals, centres, limit):  # type: ignore[no-untyped-def]
     """Offer free nodes to the planes of their neighbours, nearest first, until nothing changes."""
     count = votes.shape[0]
@@ -241,7 +241,7 @@ class PointFit(NamedTuple):
     scatter: NDArray[np.float64]  # (K, 6)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pool_points(points, corners, label, core, num, mean, scatter):  # type: ignore[no-untyped-def]
     m, s = np.zeros(3), np.zeros(6)
     own_mean, own = np.zeros(3), np.zeros(6)

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from facet.mapping.blocks import OFFSET, hash_key
+from facet.mapping.kernel import kernel
 from facet.mapping.settings import MapSettings
 from facet_protocol.messages import Pose, Scan, ScanKind
 
@@ -40,7 +40,7 @@ def rotation(pose: Pose) -> NDArray[np.float64]:
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _to_ticks(points, R, t, tick_m, near, far, bound_m, ticks, views, counts):  # type: ignore[no-untyped-def]
     """Fill ticks and views with the accepted points; counts by REASONS. Returns how many."""
     m = 0

@@ -8,7 +8,8 @@ registers. All sums are integers, so their order never matters.
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from facet.mapping.kernel import kernel
 
 MOST = 8192  # votes of a region that are looked at: w x x of so many stay below 2^31
 COLUMNS = 9  # x, y, z (1/8 voxel from the voxel's corner), weight, view x, y, z, distance,
@@ -16,7 +17,7 @@ COLUMNS = 9  # x, y, z (1/8 voxel from the voxel's corner), weight, view x, y, z
 SUMS = 11  # number, weight, w x, y, z, w xx, xy, xz, yy, yz, zz
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def decode(lists, count, seen, x0, y0, z0, votes):  # type: ignore[no-untyped-def]
     """Unpack what was listed round a voxel at packed place (x0, y0, z0) with observable `seen` into
     votes (COLUMNS, MOST) int32. A vote is of the voxel's side where their views differ by less than
@@ -60,7 +61,7 @@ def decode(lists, count, seen, x0, y0, z0, votes):  # type: ignore[no-untyped-de
         side[i] = any_side | (np.int32(near) & ((word >> 31) + 1))
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def within(votes, count, r, sums):  # type: ignore[no-untyped-def]
     """Sums of the votes of the voxel's side within r."""
     x, y, z, w, distance, side = votes[0], votes[1], votes[2], votes[3], votes[7], votes[8]
@@ -84,7 +85,7 @@ def within(votes, count, r, sums):  # type: ignore[no-untyped-def]
     sums[5], sums[6], sums[7], sums[8], sums[9], sums[10] = sxx, sxy, sxz, syy, syz, szz
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def is_one_pose(lists, votes, count, r):  # type: ignore[no-untyped-def]
     """Whether all votes of the voxel's side within r come from one known line-scan pose."""
     poses, distance, side = lists[1], votes[7], votes[8]
@@ -97,7 +98,7 @@ def is_one_pose(lists, votes, count, r):  # type: ignore[no-untyped-def]
     return known != 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def within_slab(votes, count, r, nx, ny, nz, own, slab, sums):  # type: ignore[no-untyped-def]
     """Sums of the votes within r that were seen from the side of the normal and whose centroid
     lies within `slab` of n . c = own."""
@@ -131,7 +132,7 @@ def within_slab(votes, count, r, nx, ny, nz, own, slab, sums):  # type: ignore[n
     sums[5], sums[6], sums[7], sums[8], sums[9], sums[10] = sxx, sxy, sxz, syy, syz, szz
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def covariance(sums):  # type: ignore[no-untyped-def]
     """(xx, yy, zz, xy, xz, yz) of the votes, population form (eq. 3), (1/8 voxel)^2."""
     one = 1.0 / sums[1]
@@ -146,7 +147,7 @@ def covariance(sums):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def shape(variances, floor2):  # type: ignore[no-untyped-def]
     """(lambda of eq. 18, tan gamma of eq. 9) of principal variances, floored."""
     s1 = max(variances[0], floor2)

@@ -5,8 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
+
+from facet.mapping.kernel import kernel
 
 OUTWARD = 2.0  # grid units (1/8 voxel): a border centroid sits inside its voxel
 _SHIFT = 1 << 30  # keys of vertices sort as vertices do
@@ -20,18 +21,18 @@ class Outline(NamedTuple):
     area: float  # (1/8 voxel)^2, holes taken out
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _vertex_key(u, v):  # type: ignore[no-untyped-def]
     return ((u + _SHIFT) << 32) | (v + _SHIFT)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _half(x, y):  # type: ignore[no-untyped-def]
     """0 for angles in [0, 180), 1 for [180, 360)."""
     return 0 if y > 0 or (y == 0 and x > 0) else 1
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _before(ax, ay, bx, by, rx, ry):  # type: ignore[no-untyped-def]
     """Whether a comes before b, turning clockwise from the direction r (r itself comes last)."""
     au, av = ax * rx + ay * ry, ax * ry - ay * rx  # in r's frame, clockwise positive
@@ -43,7 +44,7 @@ def _before(ax, ay, bx, by, rx, ry):  # type: ignore[no-untyped-def]
     return au * bv - av * bu > 0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _successors(start, stop, edges):  # type: ignore[no-untyped-def]
     """(E,) for each edge the next of its ring; `start` is ascending. Interior on the left: at a
     vertex the ring goes on with the first outgoing edge clockwise from the way it came."""
@@ -67,7 +68,7 @@ def _successors(start, stop, edges):  # type: ignore[no-untyped-def]
     return follow
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _keys(edges):  # type: ignore[no-untyped-def]
     start = np.empty(edges.shape[0], np.int64)
     stop = np.empty(edges.shape[0], np.int64)
@@ -135,7 +136,7 @@ def signed_area(ring: NDArray[np.int64] | NDArray[np.int32]) -> float:
     return float(np.sum(u * np.roll(v, -1) - np.roll(u, -1) * v)) / 2.0
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def inside(ring, u, v):  # type: ignore[no-untyped-def]
     """Whether the point lies inside the ring (even-odd)."""
     odd = False

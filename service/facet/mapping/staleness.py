@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from facet.mapping.bits import population, trailing_zeros
 from facet.mapping.blocks import find, pack, unpack
 from facet.mapping.halo import SIDE_BLOCKS, fill_rows, find_near
+from facet.mapping.kernel import kernel
 from facet.mapping.settings import BLOCK
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def mark_dirty(columns, rows, dirty, flags, out):  # type: ignore[no-untyped-def]
     """Set the rows' bits in dirty (B, 8) and list their blocks once. Returns how many blocks."""
     count = 0
@@ -27,7 +27,7 @@ def mark_dirty(columns, rows, dirty, flags, out):  # type: ignore[no-untyped-def
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def find_candidates(blocks, deepest, sources, flags, out):  # type: ignore[no-untyped-def]
     """Blocks that look as far as one of the blocks `sources`, these included. deepest (1 + B,):
     the largest reach of all, then by block. Returns how many."""
@@ -60,7 +60,7 @@ def find_candidates(blocks, deepest, sources, flags, out):  # type: ignore[no-un
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def find_stale(blocks, dirty, reach, block, deepest, common, near, lines, stale):  # type: ignore[no-untyped-def]
     """Set in stale (8,) the bits of a block's voxels that look at a dirty one, or are dirty
     themselves. `common` is the reach that most voxels have. Returns how many."""
@@ -91,7 +91,7 @@ def find_stale(blocks, dirty, reach, block, deepest, common, near, lines, stale)
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _column(lines, edge, y, z, r):  # type: ignore[no-untyped-def]
     """All rows within r of the row (y, z), one over the other."""
     seen = np.uint64(0)

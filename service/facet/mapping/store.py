@@ -10,10 +10,10 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from facet.mapping.blocks import Blocks, add_block, find, pack, rehash, unpack_all
+from facet.mapping.kernel import kernel
 from facet.mapping.quantise import VIEW, Ticks
 from facet.mapping.settings import BLOCK, TICKS
 
@@ -36,7 +36,7 @@ class Columns(NamedTuple):
     touched: NDArray[np.bool_]  # moments changed since the last settle
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched_rows):  # type: ignore[no-untyped-def]
     """Add points from `start` on with `sign`. Returns (next point, blocks, rows, touched) used;
     next < N means that a capacity ran out and the caller must grow and go on."""
@@ -94,7 +94,7 @@ def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched
     return ticks.shape[0], num_blocks, num_rows, num_touched
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def shift_moments(own, x, y, z, total):  # type: ignore[no-untyped-def]
     """Add moments (10,) to `total`, about a corner that lies x, y, z voxels before their own."""
     n, dx, dy, dz = own[0], TICKS * x, TICKS * y, TICKS * z
@@ -110,7 +110,7 @@ def shift_moments(own, x, y, z, total):  # type: ignore[no-untyped-def]
     total[9] += own[9] + 2 * dz * own[3] + n * dz * dz
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _coarse(component):  # type: ignore[no-untyped-def]
     """A component of a direction, in eighths: 1, 4 or 7 with its sign. The sign is what tells the
     side of a surface; the rest mostly drifts with the sensor."""
@@ -123,7 +123,7 @@ def _coarse(component):  # type: ignore[no-untyped-def]
     return eighths if component >= 0.0 else -eighths
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def observe(moments, views, poses):  # type: ignore[no-untyped-def]
     """A voxel's observable, 49 bits: centroid in eighths (4, 4, 4), from SETTLED points on in
     quarters; votes min(n, 8) (4); direction towards the sensor, `_coarse` (5, 5, 5); mixed (1);
@@ -153,7 +153,7 @@ def observe(moments, views, poses):  # type: ignore[no-untyped-def]
     return word
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _settle(blocks, columns, touched_rows, num_touched, dirty_rows):  # type: ignore[no-untyped-def]
     """Refresh the observables of touched rows. Returns how many of them changed."""
     num_dirty = 0
@@ -177,7 +177,7 @@ def _settle(blocks, columns, touched_rows, num_touched, dirty_rows):  # type: ig
     return num_dirty
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _add_blocks(blocks, keys):  # type: ignore[no-untyped-def]
     """Add the blocks of keys (B,) to none. How many."""
     for b in range(keys.shape[0]):
@@ -185,7 +185,7 @@ def _add_blocks(blocks, keys):  # type: ignore[no-untyped-def]
     return keys.shape[0]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _place(blocks, columns, rows):  # type: ignore[no-untyped-def]
     """Enter rows in their blocks."""
     for row in range(rows):

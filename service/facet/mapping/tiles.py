@@ -9,10 +9,10 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from facet.mapping.blocks import CENTRE, pack, pack_all, unpack, unpack_all
+from facet.mapping.kernel import kernel
 from facet.mapping.membership import collect, inherit, shell
 from facet.mapping.merging import Limits, Nodes, merge_nodes
 from facet.mapping.normals import UNIT
@@ -52,7 +52,7 @@ class Tile:
         return self.rows[low:high]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _tile_nodes(block_keys, neighbours, patches, which, tile_key):  # type: ignore[no-untyped-def]
     """Nodes and candidate edges of a tile's patches, in order of block key and patch index."""
     count = 0
@@ -112,7 +112,7 @@ def _tile_nodes(block_keys, neighbours, patches, which, tile_key):  # type: igno
     return votes, mean, scatter, unit, edges[:num_edges]
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _gather_points(block_keys, patches, which, tile_key, plane_of_patch, count):  # type: ignore[no-untyped-def]
     """(count, 10) exact point moments about the tile corner, ticks, and (count,) all points."""
     out = np.zeros((count, MOMENTS), np.int64)
@@ -129,7 +129,7 @@ def _gather_points(block_keys, patches, which, tile_key, plane_of_patch, count):
     return out, total
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _pairs(blocks, patches, plane_of_patch, tile_key, which, out):  # type: ignore[no-untyped-def]
     """Adjacent tile-planes, the smaller tile first, as own << 32 | place of the other tile among
     the 27 << 16 | other; with repetitions. How many, or -1 where `out` is too short."""
@@ -165,7 +165,7 @@ def _pairs(blocks, patches, plane_of_patch, tile_key, which, out):  # type: igno
     return count
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def tile_keys_of(block_keys):  # type: ignore[no-untyped-def]
     """(B,) tile key of each block key."""
     out = np.empty(block_keys.shape[0], np.int64)

@@ -6,9 +6,9 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
-from numba import njit
 
 from facet.mapping.blocks import pack
+from facet.mapping.kernel import kernel
 from facet.mapping.quantise import Ticks
 from facet_protocol.messages import Scan
 
@@ -22,7 +22,7 @@ class Sighting:
     robots: set[str] = field(default_factory=set)
 
 
-@njit(cache=True, nogil=True)
+@kernel
 def _tile_runs(ticks):  # type: ignore[no-untyped-def]
     """Tile keys of points (N, 3) ticks, runs of equal ones shortened to one."""
     out = np.empty(ticks.shape[0], np.int64)
