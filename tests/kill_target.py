@@ -19,14 +19,16 @@ from facet_protocol.messages import Envelope
 SETTINGS = MapSettings(voxel_m=0.1)
 
 
-def config_of(folder: Path, endpoint: str = "tcp/127.0.0.1:7447") -> Config:
+def config_of(
+    folder: Path, endpoint: str = "tcp/127.0.0.1:7447", checkpoint_s: float = 0.4
+) -> Config:
     """Often a checkpoint, so that some are killed in the middle of one."""
     overrides = {
         "network.listen": [endpoint],
         "network.shared_memory": False,
         "record.directory": folder,
         "record.min_free_bytes": 0,
-        "record.checkpoint_s": 0.4,
+        "record.checkpoint_s": checkpoint_s,
         "record.max_file_bytes": 2 << 20,
         "mapping.voxel_m": SETTINGS.voxel_m,
         "publish.points": False,
@@ -34,8 +36,8 @@ def config_of(folder: Path, endpoint: str = "tcp/127.0.0.1:7447") -> Config:
     return load_config(None, overrides)
 
 
-def main(folder: Path, endpoint: str) -> None:
-    config = config_of(folder, endpoint)
+def main(folder: Path, endpoint: str, checkpoint_s: float) -> None:
+    config = config_of(folder, endpoint, checkpoint_s)
     resumed = resume(config, Mapper(SETTINGS))
     with open_session(service_settings(config.network)) as session:
         service = Service(session, config, resumed.mapper, resumed)
@@ -53,4 +55,4 @@ def main(folder: Path, endpoint: str) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2])
+    main(Path(sys.argv[1]), sys.argv[2], float(sys.argv[3]))

@@ -62,11 +62,11 @@ class Robots(threading.Thread):
 class Victim:
     """A service in a process of its own, and what it acknowledged before it was killed."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, checkpoint_s: float = 0.4) -> None:
         self.endpoint = free_endpoint()
         target = Path(__file__).with_name("kill_target.py")
         self._process = subprocess.Popen(
-            [sys.executable, str(target), str(folder), self.endpoint],
+            [sys.executable, str(target), str(folder), self.endpoint, str(checkpoint_s)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,
