@@ -8,6 +8,7 @@ import numpy as np
 
 from facet_protocol.codec import Message, encode
 from facet_protocol.messages import (
+    Corrected,
     CorrectedPose,
     Correction,
     Cut,
@@ -135,6 +136,7 @@ EXAMPLES: dict[str, Message] = {
     "facet.v1.Cut": Cut(9, "r1", "front", 7, 42, STAMP_NS, 3),
     "facet.v1.ResolvedPose": ResolvedPose("r1", "front", 7, 42, STAMP_NS, "map", POSE),
     "facet.v1.Correction": Correction("r1", (CorrectedPose("front", 7, 42, POSE),)),
+    "facet.v1.Corrected": Corrected("r1", 7, 42, STAMP_NS, 1),
     "facet.v1.Loss": Loss("r1", "front", 7, 43, 5, "lost_upstream", STAMP_NS),
 }
 

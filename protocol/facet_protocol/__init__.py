@@ -12,6 +12,7 @@ from facet_protocol.codec import (
     facet_descriptors,
 )
 from facet_protocol.messages import (
+    Corrected,
     CorrectedPose,
     Correction,
     Cut,
@@ -48,6 +49,7 @@ from facet_protocol.scene import encode_scene, encode_tiles_cloud
 __all__ = [
     "SCHEMAS",
     "Attachment",
+    "Corrected",
     "CorrectedPose",
     "Correction",
     "Cut",

@@ -19,6 +19,7 @@ from google.protobuf.message import Message as Protobuf
 
 from facet_protocol import maps, poses, records, scans
 from facet_protocol.messages import (
+    Corrected,
     Correction,
     Cut,
     Envelope,
@@ -55,6 +56,7 @@ Message = (
     | Cut
     | ResolvedPose
     | Correction
+    | Corrected
     | Loss
 )
 
@@ -116,6 +118,9 @@ SCHEMAS: dict[str, Schema] = {
     ),
     "facet.v1.Correction": _row(
         Correction, records.encode_correction, records.decode_correction, service_pb2.Correction
+    ),
+    "facet.v1.Corrected": _row(
+        Corrected, records.encode_corrected, records.decode_corrected, service_pb2.Corrected
     ),
     "facet.v1.Loss": _row(Loss, records.encode_loss, records.decode_loss, service_pb2.Loss),
 }

@@ -157,7 +157,7 @@ class ResolvedPose:
 @dataclass(frozen=True, slots=True, eq=False)
 class CorrectedPose:
     sensor: str
-    epoch: int
+    epoch: int  # of the scan; 0 where it has none: the epoch that its sensor is in
     sequence: int
     pose: Pose  # the new T_world_sensor
 
@@ -168,6 +168,18 @@ class Correction:
 
     robot: str
     poses: tuple[CorrectedPose, ...]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Corrected:
+    """What became of a correction, known by the numbers of its own message."""
+
+    robot: str
+    epoch: int
+    sequence: int
+    stamp_ns: int
+    num_scans: int
+    reason: str = ""  # why none of it was applied; "": all of it was
 
 
 class PlaneClass(StrEnum):

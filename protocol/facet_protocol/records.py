@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from facet_protocol.messages import (
+    Corrected,
     CorrectedPose,
     Correction,
     Cut,
@@ -102,6 +103,22 @@ def decode_correction(payload: bytes | memoryview) -> Correction:
     m = parse(pb.Correction, payload)
     poses = (CorrectedPose(p.sensor, p.epoch, p.sequence, _pose_of(p.pose)) for p in m.poses)
     return Correction(m.robot, tuple(poses))
+
+
+def encode_corrected(corrected: Corrected) -> bytes:
+    return pb.Corrected(
+        robot=corrected.robot,
+        epoch=corrected.epoch,
+        sequence=corrected.sequence,
+        stamp_ns=corrected.stamp_ns,
+        num_scans=corrected.num_scans,
+        reason=corrected.reason,
+    ).SerializeToString(deterministic=True)
+
+
+def decode_corrected(payload: bytes | memoryview) -> Corrected:
+    m = parse(pb.Corrected, payload)
+    return Corrected(m.robot, m.epoch, m.sequence, m.stamp_ns, m.num_scans, m.reason)
 
 
 def encode_loss(loss: Loss) -> bytes:

@@ -12,6 +12,7 @@ PREFIX = "facet/v1"
 # Topics that only the log has; no Zenoh key starts with a slash.
 CUT_TOPIC = "/facet/cut"
 RESOLVED_TOPIC = "/facet/resolved"
+CORRECTED_TOPIC = "/facet/corrected"
 UPDATE_TOPIC = "/facet/update"
 EVENTS_TOPIC = "/facet/events"
 SCENE_TOPIC = "/facet/scene"
@@ -101,6 +102,10 @@ def correction_key(map_id: str, robot: str) -> str:
 def corrections_key(map_id: str) -> str:
     """Key expression of every robot's corrections."""
     return _key(map_id, "robot/*/correction")
+
+
+def is_correction_key(key: str) -> bool:
+    return _CORRECTION_KEY.fullmatch(key) is not None
 
 
 def parse_correction_key(key: str) -> tuple[str, str]:

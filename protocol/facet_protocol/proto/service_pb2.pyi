@@ -70,6 +70,22 @@ class Correction(_message.Message):
     poses: _containers.RepeatedCompositeFieldContainer[CorrectedPose]
     def __init__(self, robot: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[CorrectedPose, _Mapping]]] = ...) -> None: ...
 
+class Corrected(_message.Message):
+    __slots__ = ("robot", "epoch", "sequence", "stamp_ns", "num_scans", "reason")
+    ROBOT_FIELD_NUMBER: _ClassVar[int]
+    EPOCH_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    STAMP_NS_FIELD_NUMBER: _ClassVar[int]
+    NUM_SCANS_FIELD_NUMBER: _ClassVar[int]
+    REASON_FIELD_NUMBER: _ClassVar[int]
+    robot: str
+    epoch: int
+    sequence: int
+    stamp_ns: int
+    num_scans: int
+    reason: str
+    def __init__(self, robot: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., num_scans: _Optional[int] = ..., reason: _Optional[str] = ...) -> None: ...
+
 class Loss(_message.Message):
     __slots__ = ("robot", "sensor", "epoch", "first_sequence", "count", "reason", "stamp_ns")
     ROBOT_FIELD_NUMBER: _ClassVar[int]
