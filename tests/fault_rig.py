@@ -74,7 +74,7 @@ class Line:
     def num_points(self) -> int:
         """Points that the voxels hold."""
         store = self.mapper._store
-        return int(store.columns.moments[store.occupied_rows(), 0].sum())
+        return int(store.num_points(store.occupied_rows()).sum())
 
 
 def small_scan(sequence: int, robot: str = "r1", num: int = 300) -> Scan:

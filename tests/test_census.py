@@ -26,8 +26,8 @@ def balanced(mapper: Mapper, scans: list[Scan]) -> None:
     assert counts.scans == len(scans)
     assert counts.points_in == sum(len(s.points) for s in scans)
     assert counts.points_in == counts.points_stored + sum(counts.points_rejected.values())
-    moments = mapper._store.columns.moments[: mapper._store.num_rows]
-    assert counts.points_stored == moments[:, 0].sum()
+    held = mapper._store.num_points(np.arange(mapper._store.num_rows))
+    assert counts.points_stored == held.sum()
     assert all(n > 0 for n in counts.points_rejected.values())
 
 

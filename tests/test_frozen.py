@@ -74,8 +74,8 @@ def test_what_waits_for_an_update_cannot_be_frozen() -> None:
 
 
 FAULTS: dict[str, Callable[[Arrays], object]] = {
-    "a column is missing": lambda a: a.pop("voxel/moments"),
-    "a column is short": lambda a: a.update({"voxel/views": a["voxel/views"][:-1]}),
+    "a column is missing": lambda a: a.pop("voxel/low"),
+    "a column is short": lambda a: a.update({"voxel/middle": a["voxel/middle"][:-1]}),
     "another type": lambda a: a.update({"normal/unit": a["normal/unit"].astype(np.int64)}),
     "a voxel in no block": lambda a: a["voxel/block"].__setitem__(0, 1 << 20),
     "a voxel in no place": lambda a: a["voxel/local"].__setitem__(0, 512),

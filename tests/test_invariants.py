@@ -40,10 +40,10 @@ FAULTS: dict[str, Callable[[Mapper], object]] = {
     "a neighbour link": lambda m: add(m._store.blocks.neighbours, (0, 4), 1),
     "a block key": lambda m: add(m._store.blocks.keys, 3, 1),
     "a row": lambda m: add(m._store.columns.local, 5, 1),
-    "a point more": lambda m: add(m._store.columns.moments, (7, 0), 1),
-    "a sum": lambda m: add(m._store.columns.moments, (7, 1), -5000),
-    "a square": lambda m: add(m._store.columns.moments, (7, 4), 1 << 40),
-    "a view": lambda m: add(m._store.columns.views, (7, 1), 100_000),
+    "a point more": lambda m: add(m._store.columns.low, (7, 0), 1),
+    "a sum": lambda m: add(m._store.columns.low, (7, 1), -5000),
+    "a square": lambda m: add(m._store.columns.low, (7, 4), 1 << 29),
+    "a view": lambda m: add(m._store.columns.low, (7, 11), 100_000),
     "an observable": lambda m: add(m._store.columns.observable, 9, 1 << 4),
     "an occupied bit": lambda m: add(m._store.blocks.occupied, (2, 3), 1),
     "a class": lambda m: m._normals.normals.kind.__setitem__(9, 0),
@@ -89,7 +89,7 @@ def test_while_scans_wait_only_the_integers_are_checked() -> None:
     mapper = room()
     mapper.insert(log("room-lidar3d").scans[0])
     mapper.check_invariants()
-    mapper._store.columns.moments[3, 0] += 1
+    mapper._store.columns.low[3, 0] += 1
     with pytest.raises(AssertionError):
         mapper.check_invariants()
 

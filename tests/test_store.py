@@ -13,6 +13,7 @@ from facet.mapping.freespace import FreeSpace
 from facet.mapping.invariants import check_blocks, check_moments, check_observables
 from facet.mapping.quantise import VIEW, Ticks
 from facet.mapping.store import VoxelStore, observe
+from facet.mapping.sums import sums_of, write_sums
 
 NOBODY = np.zeros((0, 3), np.int64)
 
@@ -29,11 +30,9 @@ def ticks_of(seed: int, count: int, width: int = 12, pose_hash: int = -1) -> Tic
 def table(store: VoxelStore) -> dict[tuple[int, int, int], tuple[list[int], ...]]:
     """Occupied voxels by index: moments, views, poses."""
     rows = store.occupied_rows()
-    c = store.columns
-    poses = c.poses[rows] if len(c.poses) else np.zeros((len(rows), 3), np.int64)
     columns = zip(
-        store.voxel_keys(rows).tolist(), c.moments[rows].tolist(), c.views[rows].tolist(),
-        poses.tolist(), strict=True,
+        store.voxel_keys(rows).tolist(), store.moments(rows).tolist(), store.views(rows).tolist(),
+        store.columns.poses[rows].tolist(), strict=True,
     )  # fmt: skip
     return {tuple(key): (m, v, h) for key, m, v, h in columns}
 
@@ -79,7 +78,7 @@ def test_moments_are_those_of_a_plain_sum() -> None:
 def test_moments_of_a_voxel_are_those_of_its_points() -> None:
     points = np.random.default_rng(4).integers(0, 1024, (5000, 3))
     scan = ticks_of(0, 5000)._replace(points=points)
-    m = filled([scan]).columns.moments[0].astype(float)
+    m = filled([scan]).moments(np.zeros(1, np.int32))[0].astype(float)
     spread = np.cov(points.T, bias=True)
     found = m[4:] / m[0] - np.outer(m[1:4], m[1:4])[np.triu_indices(3)] / m[0] ** 2
     np.testing.assert_allclose(found, spread[np.triu_indices(3)], rtol=1e-9)
@@ -132,7 +131,7 @@ def test_growing_loses_nothing() -> None:
     scans.append(ticks_of(9, 20_000, width=400, pose_hash=5))
     store = filled(scans)
     assert store.num_blocks > 4096
-    assert int(store.columns.moments[:, 0].sum()) == 140_000
+    assert int(store.num_points(store.occupied_rows()).sum()) == 140_000
     assert int(store.columns.poses[:, 0].sum()) == 20_000
     check_blocks(store)
     check_moments(store)
@@ -156,7 +155,7 @@ def test_settle_tells_what_changed_and_only_that() -> None:
 
 
 def seen(
-    moments: list[int], views: tuple[int, int, int], poses: tuple[int, ...] = ()
+    moments: list[int], views: tuple[int, int, int], poses: tuple[int, ...] = (0, 0, 0)
 ) -> dict[str, object]:
     """The parts of an observable."""
     full = np.zeros(10, np.int64)
@@ -208,7 +207,7 @@ def test_a_voxel_knows_its_only_line_pose() -> None:
 
 def test_an_empty_voxel_has_no_observable() -> None:
     nothing: NDArray[np.int64] = np.zeros(10, np.int64)
-    assert observe(nothing, np.zeros(3, np.int64), np.zeros(0, np.int64)) == 0
+    assert observe(nothing, np.zeros(3, np.int64), np.zeros(3, np.int64)) == 0
 
 
 def test_the_mean_observable_fades_as_one_over_n() -> None:
@@ -223,3 +222,47 @@ def test_the_mean_observable_fades_as_one_over_n() -> None:
         flips[n] = len(store.settle()) / 400
     late = np.mean([n * flips[n] for n in range(80, 161)])
     assert 0.2 < late < 4.0
+
+
+def test_sums_beyond_their_low_parts_are_exact() -> None:
+    """A voxel's sums as after half a million points: carried up, carried down, frozen, undone."""
+    scan = ticks_of(0, 30_000, width=1)
+    many = 700  # times that scan: some 2 * 10^6 points a voxel
+    store, once = filled([scan]), filled([scan])
+    rows = store.occupied_rows()
+    sums = many * sums_of(store.columns, rows)
+    store.columns.low[rows] = 0
+    for row, own in zip(rows, sums, strict=True):
+        write_sums(store.columns, row, own)
+    np.testing.assert_array_equal(sums_of(store.columns, rows), sums)
+    assert store.columns.high.any()
+    assert int(store.num_points(rows).sum()) == many * 30_000
+    again = VoxelStore()
+    again.restore(store.freeze(), store.blocks.keys[: store.num_blocks])
+    assert digest(again) == digest(store)
+    again.remove(scan)
+    np.testing.assert_array_equal(again.moments(rows), (many - 1) * once.moments(rows))
+    np.testing.assert_array_equal(again.views(rows), (many - 1) * once.views(rows))
+
+
+def test_sums_are_carried_point_by_point() -> None:
+    """The same 20,000 points again and again, past the range of the low parts on both sides."""
+    points = np.full((20_000, 3), 1023)
+    views = np.tile(np.array([VIEW, 0, -VIEW], np.int16), (20_000, 1))
+    scan = Ticks(points, views, NOBODY, np.zeros(3, np.int64), -1, {})
+    store, row = VoxelStore(), np.zeros(1, np.int32)
+    for times in range(1, 21):
+        store.insert(scan)
+        n = 20_000 * times
+        expected = [n, *[1023 * n] * 3, *[1023**2 * n] * 6]
+        assert store.moments(row)[0].tolist() == expected
+        assert store.views(row)[0].tolist() == [VIEW * n, 0, -VIEW * n]
+    assert store.columns.high.any()
+    for _ in range(25):
+        store.remove(scan)
+    assert store.moments(row)[0].tolist() == [
+        -v for v in [100_000, *[1023 * 100_000] * 3, *[1023**2 * 100_000] * 6]
+    ]
+    for _ in range(5):
+        store.insert(scan)
+    assert digest(store) == digest(VoxelStore())

@@ -24,7 +24,7 @@ def num_voxels(mapper: Mapper) -> int:
 def points_in_view(mapper: Mapper, scan: Scan) -> NDArray[np.int64]:
     """(W,) points of each voxel that a scan touches. Call it right after the scan's insert."""
     store = mapper._store
-    return np.asarray(store.columns.moments[store.touched_rows, 0], np.int64)
+    return store.num_points(store.touched_rows)
 
 
 def forget_touched(mapper: Mapper, scan: Scan) -> NDArray[np.int64]:
@@ -45,10 +45,11 @@ def centroids(mapper: Mapper) -> tuple[NDArray[np.float64], NDArray[np.float64]]
     """Exact centroids (V, 3) m of the occupied voxels, and unit vectors (V, 3) to the sensor."""
     store, tick_m = mapper._store, mapper.settings.tick_m
     rows = store.occupied_rows()
-    n = store.columns.moments[rows, :1].astype(np.float64)
-    local = store.columns.moments[rows, 1:4] / n + 0.5
+    moments = store.moments(rows)
+    n = moments[:, :1].astype(np.float64)
+    local = moments[:, 1:4] / n + 0.5
     corner = store.voxel_keys(rows).astype(np.float64) * TICKS
-    views = store.columns.views[rows].astype(np.float64)
+    views = store.views(rows).astype(np.float64)
     views /= np.maximum(np.linalg.norm(views, axis=1, keepdims=True), 1e-9)
     return (corner + local) * tick_m, views
 

@@ -100,6 +100,7 @@ class Blocks(NamedTuple):
 def add_block(blocks: Blocks, count: int, key: int) -> int:
     """Append the block `key` as number `count` and link it with its neighbours. Returns `count`."""
     blocks.keys[count] = key
+    blocks.rows[count] = -1
     put(blocks.table_keys, blocks.table_values, key, count)
     bi, bj, bk = unpack(key)
     for n in range(27):

@@ -75,7 +75,7 @@ class Census:
             sparse=int(kinds[SPARSE]),
             mixed=int(kinds[MIXED]),
             discarded=len(off),
-            discarded_points=int(store.columns.moments[off, 0].sum()),
+            discarded_points=int(store.num_points(off).sum()),
             sigma_n_m=sigma_m,
         )
 

@@ -29,13 +29,11 @@ def state_digest(store: VoxelStore, free: FreeSpace) -> str:
     keys = pack_all(store.voxel_keys(rows))
     order = np.argsort(keys)
     rows = rows[order]
-    columns = store.columns
     h = hashlib.sha256()
     h.update(keys[order].astype("<i8").tobytes())
-    h.update(columns.moments[rows].astype("<i8").tobytes())
-    h.update(columns.views[rows].astype("<i8").tobytes())
-    poses = columns.poses[rows] if len(columns.poses) else np.zeros((len(rows), 3), np.int64)
-    h.update(poses.astype("<i8").tobytes())
+    h.update(store.moments(rows).astype("<i8").tobytes())
+    h.update(store.views(rows).astype("<i8").tobytes())
+    h.update(store.columns.poses[rows].astype("<i8").tobytes())
     cells, counts = free.cells()
     h.update(cells.astype("<i8").tobytes())
     h.update(counts.astype("<i8").tobytes())

@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from facet.mapping.blocks import Int64Array, find, hash_key, pack, put, rehash, unpack
 from facet.mapping.kernel import kernel
+from facet.mapping.memory import Heap, Memory
 from facet.mapping.quantise import Ticks
 from facet.mapping.settings import TICKS
 
@@ -105,9 +106,10 @@ def passed(table_keys, table_values, counts, points, least):  # type: ignore[no-
 class FreeSpace:
     """Beam counts by cell of 4 voxels, in dense blocks of 8^3 cells."""
 
-    def __init__(self) -> None:
+    def __init__(self, memory: Memory | None = None) -> None:
+        self._memory = memory or Heap()
         self._keys = np.zeros(FIRST_BLOCKS, np.int64)
-        self._counts = np.zeros((FIRST_BLOCKS, 512), np.int32)
+        self._counts = self._memory.grown(np.zeros((0, 512), np.int32), 0, FIRST_BLOCKS)
         self._table = rehash(self._keys, 0, 4 * FIRST_BLOCKS)
         self.num_blocks = 0
 
@@ -120,7 +122,8 @@ class FreeSpace:
         if counts.shape != (len(keys), 512) or len(np.unique(keys)) < len(keys):
             raise ValueError(f"{counts.shape} cells for {len(keys)} blocks of free space")
         capacity = max(FIRST_BLOCKS, len(keys))
-        self._keys, self._counts = np.zeros(capacity, np.int64), np.zeros((capacity, 512), np.int32)
+        self._keys = np.zeros(capacity, np.int64)
+        self._counts = self._memory.grown(self._counts, 0, capacity)
         self._keys[: len(keys)], self._counts[: len(keys)] = keys, counts
         self._table = rehash(self._keys, len(keys), 4 << (capacity - 1).bit_length())
         self.num_blocks = len(keys)
@@ -159,9 +162,9 @@ class FreeSpace:
 
     def _grow(self) -> None:
         capacity = 2 * len(self._keys)
-        keys, counts = np.zeros(capacity, np.int64), np.zeros((capacity, 512), np.int32)
-        keys[: len(self._keys)], counts[: len(self._counts)] = self._keys, self._counts
-        self._keys, self._counts = keys, counts
+        keys = np.zeros(capacity, np.int64)
+        keys[: len(self._keys)] = self._keys
+        self._keys, self._counts = keys, self._memory.grown(self._counts, self.num_blocks, capacity)
         self._table = rehash(keys, self.num_blocks, 4 << (capacity - 1).bit_length())
 
 

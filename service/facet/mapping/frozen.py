@@ -30,7 +30,7 @@ def freeze(mapper: Mapper) -> dict[str, NDArray[Any]]:
     if len(store.touched_rows):
         raise ValueError(f"{len(store.touched_rows)} voxels wait for an update")
     rows, keys = store.num_rows, sorted(tiles)
-    arrays = {f"voxel/{name}": c[:rows].copy() for name, c in store.columns._asdict().items()}
+    arrays = {f"voxel/{name}": column for name, column in store.freeze().items()}
     normals = mapper._normals.normals._asdict()
     arrays.update((f"normal/{name}", c[:rows].copy()) for name, c in normals.items())
     arrays["block/keys"] = store.blocks.keys[: store.num_blocks].copy()

@@ -17,6 +17,7 @@ from facet.mapping.planes import FREE
 from facet.mapping.quantise import VIEW
 from facet.mapping.settings import TICKS
 from facet.mapping.store import VoxelStore, observe
+from facet.mapping.sums import TOUCHED
 from facet_protocol.messages import Plane
 
 if TYPE_CHECKING:
@@ -33,7 +34,7 @@ def check_invariants(mapper: Mapper) -> None:
     store = mapper._store
     check_blocks(store)
     check_moments(store)
-    total = int(store.columns.moments[: store.num_rows, 0].sum())
+    total = int(store.num_points(store.occupied_rows()).sum())
     stored = mapper._census._points_stored
     assert total == stored, f"voxels hold {total} points, scans brought {stored}"
     if len(store.touched_rows):
@@ -70,39 +71,38 @@ def check_blocks(store: VoxelStore) -> None:
 
 def check_moments(store: VoxelStore) -> None:
     """I2, as far as moments tell: they are those of some points with local ticks 0..1023."""
-    m = store.columns.moments[: store.num_rows]
-    views = store.columns.views[: store.num_rows]
+    rows = np.arange(store.num_rows, dtype=np.int32)
+    m, views = store.moments(rows), store.views(rows)
     poses = store.columns.poses[: store.num_rows]
     n = m[:, 0]
     assert np.all(n >= 0), "a voxel holds less than nothing"
     void = n == 0
     assert not np.any(m[void]), "an empty voxel has moments"
     assert not np.any(views[void]), "an empty voxel has views"
-    assert not len(poses) or not np.any(poses[void]), "an empty voxel has poses"
+    assert not np.any(poses[void]), "an empty voxel has poses"
     for axis, square in enumerate((4, 7, 9)):
         one, two = m[:, 1 + axis], m[:, square]
         assert np.all((one >= 0) & (one <= (TICKS - 1) * n)), "a centroid lies outside its voxel"
         assert np.all(two <= (TICKS - 1) * one), "a second moment is too large"
         assert np.all(n * two >= one * one), "a variance is negative"
     assert np.all(np.abs(views) <= VIEW * n[:, None]), "a view is longer than a unit vector"
-    if len(poses):
-        assert np.all((poses[:, 0] >= 0) & (poses[:, 0] <= n)), "more line points than points"
-        assert np.all(poses[:, 0] * poses[:, 2] >= poses[:, 1] ** 2), "pose sums of no poses"
+    assert np.all((poses[:, 0] >= 0) & (poses[:, 0] <= n)), "more line points than points"
+    assert np.all(poses[:, 0] * poses[:, 2] >= poses[:, 1] ** 2), "pose sums of no poses"
 
 
 @kernel
 def _observe_all(moments, views, poses, count):  # type: ignore[no-untyped-def]
     out = np.empty(count, np.int64)
-    none = poses[:0].reshape(-1)
     for row in range(count):
-        out[row] = observe(moments[row], views[row], poses[row] if len(poses) else none)
+        out[row] = observe(moments[row], views[row], poses[row])
     return out
 
 
 def check_observables(store: VoxelStore) -> None:
     """Every observable is that of the moments, and the occupied bits say which are not empty."""
     c, count = store.columns, store.num_rows
-    seen = _observe_all(c.moments, c.views, c.poses, count)
+    rows = np.arange(count, dtype=np.int32)
+    seen = _observe_all(store.moments(rows), store.views(rows), c.poses, count)
     assert np.array_equal(seen, c.observable[:count]), "an observable is out of date"
     bits = np.zeros_like(store.blocks.occupied)
     on = np.flatnonzero(seen)
@@ -176,7 +176,7 @@ def _points_by_plane(mapper: Mapper) -> dict[int, tuple[int, int]]:
     for tile in mapper._tiles.tiles.values():
         own, owner = tile.rows[~tile.corner], tile.owner[~tile.corner]
         sums = np.zeros((tile.num_planes, 2), np.int64)
-        points = store.columns.moments[own, 0]
+        points = store.num_points(own)
         np.add.at(sums[:, 0], owner, np.where(patches.member[own] >= 0, points, 0))
         np.add.at(sums[:, 1], owner, points)
         for plane_id, (members, voxels) in zip(tile.ids.tolist(), sums.tolist(), strict=False):
@@ -250,7 +250,7 @@ def _unsettled(store: VoxelStore, anew: VoxelStore) -> None:
     anew.blocks = store.blocks._replace(occupied=np.zeros_like(store.blocks.occupied))
     anew.columns = store.columns._replace(
         observable=np.zeros_like(store.columns.observable),
-        touched=np.zeros_like(store.columns.touched),
+        flags=store.columns.flags & ~TOUCHED,
     )
     anew.num_blocks, anew.num_rows = store.num_blocks, store.num_rows
     anew._touched_rows, anew._num_touched = rows, len(rows)

@@ -18,6 +18,7 @@ from facet.mapping.fitting import fit_plane
 from facet.mapping.freespace import FreeSpace
 from facet.mapping.identity import Heritage, Identity
 from facet.mapping.invariants import check_invariants
+from facet.mapping.memory import Heap, Memory
 from facet.mapping.merging import limits
 from facet.mapping.normals import NormalField
 from facet.mapping.patches import PatchField
@@ -58,17 +59,23 @@ class Mapper:
     One owner, one thread. `insert` and `retract` take scans, `update` derives what they changed;
     plane ids and events alone depend on when `update` is called (design 2)."""
 
-    def __init__(self, settings: MapSettings | None = None, map_id: str = "map") -> None:
+    def __init__(
+        self,
+        settings: MapSettings | None = None,
+        map_id: str = "map",
+        memory: Memory | None = None,
+    ) -> None:
         self.settings = settings or MapSettings()
         self.map_id = map_id
         self.revision = 0
         self.work: dict[str, int] = {}
         self.changed_tiles: list[TileIndex] = []
-        self._store = VoxelStore()
-        self._free = FreeSpace()
-        self._normals = NormalField(self.settings)
-        self._patches = PatchField(self.settings)
-        self._tiles = TileField()
+        self._memory = memory or Heap()
+        self._store = VoxelStore(self._memory)
+        self._free = FreeSpace(self._memory)
+        self._normals = NormalField(self.settings, self._memory)
+        self._patches = PatchField(self.settings, self._memory)
+        self._tiles = TileField(self._memory)
         self._bends = Bends(self.settings, self._store, self._normals, self._patches, self._tiles)
         self._contours = ContourField(self.settings)
         self._identity = Identity()
@@ -122,6 +129,7 @@ class Mapper:
             "planes_changed": len(updated),
         }
         self.revision += 1
+        self._memory.rest()
         return MapUpdate(
             map_id=self.map_id,
             revision=self.revision,

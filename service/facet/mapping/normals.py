@@ -23,6 +23,7 @@ from facet.mapping.adaptive import (
 from facet.mapping.bits import trailing_zeros
 from facet.mapping.halo import LISTS, Halo, gather, make_halos
 from facet.mapping.kernel import kernel
+from facet.mapping.memory import Heap, Memory, grow_all
 from facet.mapping.region import COLUMNS, MOST, SUMS
 from facet.mapping.settings import MapSettings
 from facet.mapping.staleness import find_candidates, find_stale, mark_dirty
@@ -135,7 +136,9 @@ def _refresh(blocks, columns, normals, deepest, dirty, which, rule, halos, count
 class NormalField:
     """Normals of all voxels, kept true to the store by re-estimating the stale ones only."""
 
-    def __init__(self, settings: MapSettings) -> None:
+    def __init__(self, settings: MapSettings, memory: Memory | None = None) -> None:
+        self._memory = memory or Heap()
+        self._num_rows = self._num_blocks = 0
         self._rule = make_rule(settings)
         self.normals = Normals(
             np.zeros((0, 3), np.int16),
@@ -156,13 +159,12 @@ class NormalField:
         for name, old, new in zip(Normals._fields, empty, columns, strict=True):
             if new.shape != (store.num_rows, *old.shape[1:]) or new.dtype != old.dtype:
                 raise ValueError(f"{name} is {new.dtype} {new.shape}, for {store.num_rows} voxels")
-        unit, kind, thickness, border, reach = normals
-        self.normals = Normals(
-            unit.copy(), kind.copy(), thickness.copy(), border.copy(), reach.copy()
-        )
         self._fit(store)
-        np.maximum.at(self._deepest, store.columns.block[: store.num_rows] + 1, reach)
-        self._deepest[0] = reach.max(initial=0)
+        fitted: tuple[NDArray[Any], ...] = tuple(self.normals)
+        for own, column in zip(fitted, columns, strict=True):
+            own[: store.num_rows] = column
+        np.maximum.at(self._deepest, store.columns.block[: store.num_rows] + 1, normals.reach)
+        self._deepest[0] = normals.reach.max(initial=0)
 
     def update(self, store: VoxelStore, dirty: NDArray[np.int32]) -> tuple[int, NDArray[np.int32]]:
         """Re-estimate what `dirty` rows (D,) made stale.
@@ -189,18 +191,13 @@ class NormalField:
     def _fit(self, store: VoxelStore) -> None:
         rows, blocks = len(store.columns.block), len(store.blocks.keys)
         if len(self.normals.kind) < rows:
-            more = rows - len(self.normals.kind)
-            self.normals = Normals(
-                *(
-                    np.concatenate([c, np.zeros((more, *c.shape[1:]), c.dtype)])
-                    for c in self.normals
-                )
-            )
+            self.normals = grow_all(self._memory, self.normals, self._num_rows, rows)
         if len(self._dirty) < blocks:
-            more = blocks - len(self._dirty)
-            self._deepest = np.concatenate([self._deepest, np.zeros(more, np.uint8)])
-            self._dirty = np.zeros((blocks, 8), np.uint64)
-            self._flags = np.zeros(blocks, np.bool_)
+            grown, used = self._memory.grown, self._num_blocks
+            self._deepest = grown(self._deepest, 1 + used, 1 + blocks)
+            self._dirty = grown(self._dirty, 0, blocks)
+            self._flags = grown(self._flags, 0, blocks)
+        self._num_rows, self._num_blocks = store.num_rows, store.num_blocks
 
 
 __all__ = [

@@ -7,7 +7,7 @@ patch carries the exact moments of its members' points, for fitting, and their s
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +17,11 @@ from facet.mapping.blocks import CENTRE
 from facet.mapping.claims import label_blocks
 from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
+from facet.mapping.memory import Heap, Memory
 from facet.mapping.normals import VALID, Normals
 from facet.mapping.settings import STEPS, MapSettings
-from facet.mapping.store import MOMENTS, VoxelStore, shift_moments
+from facet.mapping.store import VoxelStore
+from facet.mapping.sums import MOMENTS, SUMS, read_sums, shift_moments
 
 PER_BLOCK = 12  # patches of a block; what finds no place is a leftover
 RUNGS = 40
@@ -205,12 +207,13 @@ def _group_blocks(blocks, observable, normals, patches, which, grouping, changed
 
 
 @kernel
-def _add_points(blocks, moments, border, patches, block, pure, m, total):  # type: ignore[no-untyped-def]
+def _add_points(blocks, columns, border, patches, block, pure, m, total):  # type: ignore[no-untyped-def]
     """Sum the members' point moments about the block corner into m (PER_BLOCK, 10): of all, or
     only of `pure` ones: not at a border, and claimed by no plane at an angle. Count the points of
     all members in total (PER_BLOCK,)."""
     m[:] = 0
     total[:] = 0
+    sums = np.empty(SUMS, np.int64)
     for z in range(8):
         word = blocks.occupied[block, z]
         while word != np.uint64(0):
@@ -221,9 +224,10 @@ def _add_points(blocks, moments, border, patches, block, pure, m, total):  # typ
             if own_label >> 4 != CENTRE:
                 continue
             p = own_label & 15
-            total[p] += moments[row, 0]
+            read_sums(columns, row, sums)
+            total[p] += sums[0]
             if not (pure and (border[row] or patches.second[row] >= 0)):
-                shift_moments(moments[row], bit & 7, bit >> 3, z, m[p])
+                shift_moments(sums, bit & 7, bit >> 3, z, m[p])
 
 
 @kernel
@@ -240,7 +244,7 @@ def _variance(m):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sum_points(blocks, moments, border, patches, which, rungs, histogram):  # type: ignore[no-untyped-def]
+def _sum_points(blocks, columns, border, patches, which, rungs, histogram):  # type: ignore[no-untyped-def]
     """Point moments and the rung of sigma_N. Corner voxels hold points of two planes: they are
     left out where enough others are there."""
     pure = np.empty((PER_BLOCK, MOMENTS), np.int64)
@@ -248,10 +252,10 @@ def _sum_points(blocks, moments, border, patches, which, rungs, histogram):  # t
     total = np.empty(PER_BLOCK, np.int64)
     for q in range(which.shape[0]):
         block = which[q]
-        _add_points(blocks, moments, border, patches, block, True, pure, total)
+        _add_points(blocks, columns, border, patches, block, True, pure, total)
         count = np.int64(patches.number[block])
         if np.any(PURE_SHARE * pure[:count, 0] < total[:count]):
-            _add_points(blocks, moments, border, patches, block, False, whole, total)
+            _add_points(blocks, columns, border, patches, block, False, whole, total)
         for p in range(PER_BLOCK):
             votes = patches.counted[block, p]
             if votes > 0:
@@ -289,7 +293,9 @@ def _dilate(blocks, which, flags, out):  # type: ignore[no-untyped-def]
 class PatchField:
     """Patches of all blocks, kept true by grouping dirty blocks again."""
 
-    def __init__(self, settings: MapSettings) -> None:
+    def __init__(self, settings: MapSettings, memory: Memory | None = None) -> None:
+        self._memory = memory or Heap()
+        self._num_rows = self._num_blocks = 0
         self._grouping = Grouping(
             cos_angle=math.cos(math.radians(settings.patch_angle_deg)),
             offset=settings.patch_offset * STEPS,
@@ -329,7 +335,7 @@ class PatchField:
         touched = np.union1d(block_of[touched_rows], np.union1d(dirty, relabelled_blocks))
         _sum_points(
             store.blocks,
-            store.columns.moments,
+            store.columns,
             normals.border,
             self.patches,
             touched,
@@ -355,13 +361,16 @@ class PatchField:
 
     def _fit(self, store: VoxelStore) -> None:
         blocks, rows = len(store.blocks.keys), len(store.columns.block)
-        if len(self._flags) < blocks or len(self.patches.label) < rows:
+        if len(self._flags) < blocks:
             self._flags = np.zeros(blocks, np.bool_)
-            grown = []
-            columns: tuple[NDArray[Any], ...] = tuple(self.patches)
-            for name, column in zip(Patches._fields, columns, strict=True):
-                by_voxel = name in ("member", "label", "second")
-                more = (rows if by_voxel else blocks) - len(column)
-                fill = np.full((more, *column.shape[1:]), -1 if by_voxel else 0, column.dtype)
-                grown.append(np.concatenate([column, fill]))
-            self.patches = Patches(*grown)
+        columns = {}
+        for name, column in self.patches._asdict().items():
+            by_voxel = name in ("member", "label", "second")
+            capacity, used = (rows, self._num_rows) if by_voxel else (blocks, self._num_blocks)
+            if len(column) < capacity:
+                column = self._memory.grown(column, used, capacity)
+            if by_voxel:
+                column[used : store.num_rows] = -1
+            columns[name] = column
+        self.patches = Patches(**columns)
+        self._num_rows, self._num_blocks = store.num_rows, store.num_blocks

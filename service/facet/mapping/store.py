@@ -14,14 +14,23 @@ from numpy.typing import NDArray
 
 from facet.mapping.blocks import Blocks, add_block, find, pack, rehash, unpack_all
 from facet.mapping.kernel import kernel
+from facet.mapping.memory import Heap, Memory, grow_all
 from facet.mapping.quantise import VIEW, Ticks
 from facet.mapping.settings import BLOCK, TICKS
+from facet.mapping.sums import (
+    DEEP,
+    MOMENTS,
+    SUMS,
+    TOUCHED,
+    add_point,
+    carry,
+    count_points,
+    read_sums,
+    shift_moments,
+    sums_of,
+)
 
-# columns of `moments`: n, sum x, y, z, sum xx, xy, xz, yy, yz, zz of the local ticks 0..1023
-MOMENTS = 10
 SETTLED = 64  # from so many points on a centroid is rounded to 1/4 voxel: it moves half as often
-# columns of `views`: sum of the quantised unit vectors towards the sensor
-# columns of `poses`: line-scan points: count, sum h, sum h^2 of their pose hashes
 
 
 class Columns(NamedTuple):
@@ -29,11 +38,12 @@ class Columns(NamedTuple):
 
     block: NDArray[np.int32]
     local: NDArray[np.int16]  # x + 8 y + 64 z in the block
-    moments: NDArray[np.int64]  # (V, 10)
-    views: NDArray[np.int64]  # (V, 3)
-    poses: NDArray[np.int64]  # (V, 3), or (0, 3) while no line scan came
+    low: NDArray[np.int32]  # (V, SUMS) the sums of the voxel, see `sums`
+    middle: NDArray[np.int8]  # (V, SUMS)
+    high: NDArray[np.int32]  # (V, SUMS)
+    poses: NDArray[np.int64]  # (V, 3) line-scan points: count, sum h, h^2 of their pose hashes
     observable: NDArray[np.int64]  # 0: empty
-    touched: NDArray[np.bool_]  # moments changed since the last settle
+    flags: NDArray[np.uint8]  # TOUCHED, DEEP
 
 
 @kernel
@@ -66,48 +76,19 @@ def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched
             blocks.rows[last_block, local] = row
             columns.block[row] = last_block
             columns.local[row] = local
-        if not columns.touched[row]:
-            columns.touched[row] = True
+        if columns.flags[row] & TOUCHED == 0:
+            columns.flags[row] |= TOUCHED
             touched_rows[num_touched] = row
             num_touched += 1
         x, y, z = tx & 1023, ty & 1023, tz & 1023
-        m = columns.moments[row]
-        m[0] += sign
-        m[1] += sign * x
-        m[2] += sign * y
-        m[3] += sign * z
-        m[4] += sign * x * x
-        m[5] += sign * x * y
-        m[6] += sign * x * z
-        m[7] += sign * y * y
-        m[8] += sign * y * z
-        m[9] += sign * z * z
-        v = columns.views[row]
-        v[0] += sign * views[p, 0]
-        v[1] += sign * views[p, 1]
-        v[2] += sign * views[p, 2]
+        if add_point(columns.low[row], sign, x, y, z, views[p]):
+            carry(columns.low, columns.middle, columns.high, columns.flags, row)
         if pose_hash >= 0:
             h = columns.poses[row]
             h[0] += sign
             h[1] += sign * pose_hash
             h[2] += sign * pose_hash * pose_hash
     return ticks.shape[0], num_blocks, num_rows, num_touched
-
-
-@kernel
-def shift_moments(own, x, y, z, total):  # type: ignore[no-untyped-def]
-    """Add moments (10,) to `total`, about a corner that lies x, y, z voxels before their own."""
-    n, dx, dy, dz = own[0], TICKS * x, TICKS * y, TICKS * z
-    total[0] += n
-    total[1] += own[1] + n * dx
-    total[2] += own[2] + n * dy
-    total[3] += own[3] + n * dz
-    total[4] += own[4] + 2 * dx * own[1] + n * dx * dx
-    total[5] += own[5] + dx * own[2] + dy * own[1] + n * dx * dy
-    total[6] += own[6] + dx * own[3] + dz * own[1] + n * dx * dz
-    total[7] += own[7] + 2 * dy * own[2] + n * dy * dy
-    total[8] += own[8] + dy * own[3] + dz * own[2] + n * dy * dz
-    total[9] += own[9] + 2 * dz * own[3] + n * dz * dz
 
 
 @kernel
@@ -148,7 +129,7 @@ def observe(moments, views, poses):  # type: ignore[no-untyped-def]
         word |= (8 << 16) | (8 << 21) | (8 << 26)
     if length < 0.5 * VIEW * n:  # seen from both sides
         word |= np.int64(1) << 31
-    if poses.shape[0] > 0 and poses[0] == n and n * poses[2] == poses[1] * poses[1]:
+    if poses[0] == n and n * poses[2] == poses[1] * poses[1]:
         word |= (poses[1] // n + 1) << 32
     return word
 
@@ -157,12 +138,12 @@ def observe(moments, views, poses):  # type: ignore[no-untyped-def]
 def _settle(blocks, columns, touched_rows, num_touched, dirty_rows):  # type: ignore[no-untyped-def]
     """Refresh the observables of touched rows. Returns how many of them changed."""
     num_dirty = 0
-    no_poses = columns.poses[:0].reshape(-1)
+    sums = np.empty(SUMS, np.int64)
     for t in range(num_touched):
         row = touched_rows[t]
-        columns.touched[row] = False
-        poses = columns.poses[row] if columns.poses.shape[0] > 0 else no_poses
-        word = observe(columns.moments[row], columns.views[row], poses)
+        columns.flags[row] &= ~TOUCHED
+        read_sums(columns, row, sums)
+        word = observe(sums[:MOMENTS], sums[MOMENTS:], columns.poses[row])
         if word == columns.observable[row]:
             continue
         columns.observable[row] = word
@@ -175,6 +156,12 @@ def _settle(blocks, columns, touched_rows, num_touched, dirty_rows):  # type: ig
         dirty_rows[num_dirty] = row
         num_dirty += 1
     return num_dirty
+
+
+@kernel
+def _count_points(columns, rows, out):  # type: ignore[no-untyped-def]
+    for q in range(rows.shape[0]):
+        out[q] = count_points(columns, rows[q])
 
 
 @kernel
@@ -195,62 +182,67 @@ def _place(blocks, columns, rows):  # type: ignore[no-untyped-def]
             blocks.occupied[block, local >> 6] |= np.uint64(1) << np.uint64(local & 63)
 
 
-def _grown(array: NDArray[np.generic], capacity: int, fill: int) -> NDArray[np.generic]:
-    out = np.empty((capacity, *array.shape[1:]), array.dtype)
-    out[: len(array)] = array
-    out[len(array) :] = fill
-    return out
-
-
 class VoxelStore:
     """Occupied voxels with their exact moments. `insert` and `remove` are the only doors in."""
 
-    def __init__(self) -> None:
+    def __init__(self, memory: Memory | None = None) -> None:
+        self._memory = memory or Heap()
         blocks, rows = 256, 4096
         keys, values = rehash(np.empty(0, np.int64), 0, 1024)
-        self.blocks = Blocks(
+        empty = Blocks(
             table_keys=keys,
             table_values=values,
-            keys=np.zeros(blocks, np.int64),
-            rows=np.full((blocks, 512), -1, np.int32),
-            occupied=np.zeros((blocks, 8), np.uint64),
-            neighbours=np.full((blocks, 27), -1, np.int32),
+            keys=np.zeros(0, np.int64),
+            rows=np.zeros((0, 512), np.int32),
+            occupied=np.zeros((0, 8), np.uint64),
+            neighbours=np.zeros((0, 27), np.int32),
         )
+        self.blocks = empty
         self.columns = Columns(
-            block=np.zeros(rows, np.int32),
-            local=np.zeros(rows, np.int16),
-            moments=np.zeros((rows, MOMENTS), np.int64),
-            views=np.zeros((rows, 3), np.int64),
+            block=np.zeros(0, np.int32),
+            local=np.zeros(0, np.int16),
+            low=np.zeros((0, SUMS), np.int32),
+            middle=np.zeros((0, SUMS), np.int8),
+            high=np.zeros((0, SUMS), np.int32),
             poses=np.zeros((0, 3), np.int64),
-            observable=np.zeros(rows, np.int64),
-            touched=np.zeros(rows, np.bool_),
+            observable=np.zeros(0, np.int64),
+            flags=np.zeros(0, np.uint8),
         )
         self.num_blocks = 0
         self.num_rows = 0
+        self._grow_blocks(blocks)
+        self.columns = grow_all(self._memory, self.columns, 0, rows)
         self._touched_rows = np.empty(4096, np.int32)
         self._num_touched = 0
 
+    def freeze(self) -> dict[str, NDArray[Any]]:
+        """Copies of the columns, of the high parts only where they are in use."""
+        rows = self.num_rows
+        columns = {n: c[:rows].copy() for n, c in self.columns._asdict().items() if n != "high"}
+        deep = np.flatnonzero(columns["flags"] & DEEP).astype(np.int32)
+        return columns | {"deep": deep, "high": self.columns.high[deep]}
+
     def restore(self, columns: Mapping[str, NDArray[Any]], block_keys: NDArray[np.int64]) -> None:
-        """Become the store whose columns by row (V,) and block keys (B,) these are.
+        """Become the store whose columns, as frozen, and block keys (B,) these are.
 
         Raises ValueError where they do not fit together."""
         rows, blocks = len(columns["block"]), len(block_keys)
-        fresh: dict[str, Any] = {}
-        for name, empty in self.columns._asdict().items():
-            column, length = columns[name], len(columns[name])
-            right = length == rows or (name == "poses" and length == 0)
-            if not right or column.shape[1:] != empty.shape[1:] or column.dtype != empty.dtype:
-                raise ValueError(f"{name} is {column.dtype} {column.shape} for {rows} voxels")
-            capacity = rows + 4096 if length or name != "poses" else 0
-            fresh[name] = _grown(column, capacity, 0)
-        self.columns = Columns(**fresh)
-        block, local = self.columns.block[:rows], self.columns.local[:rows]
-        if rows and not (block.min() >= 0 and block.max() < blocks):
+        deep = columns["deep"]
+        for name, own in self.columns._asdict().items():
+            column, length = columns[name], len(deep) if name == "high" else rows
+            if column.shape != (length, *own.shape[1:]) or column.dtype != own.dtype:
+                raise ValueError(f"{name} is {column.dtype} {column.shape} for {length} voxels")
+        if not np.array_equal(deep, np.flatnonzero(columns["flags"] & DEEP)):
+            raise ValueError("the voxels of many points are others than said")
+        if rows and not (columns["block"].min() >= 0 and columns["block"].max() < blocks):
             raise ValueError(f"a voxel lies in no one of {blocks} blocks")
-        if rows and not (local.min() >= 0 and local.max() < BLOCK**3):
+        if rows and not (columns["local"].min() >= 0 and columns["local"].max() < BLOCK**3):
             raise ValueError("a voxel lies in no place of its block")
         if len(np.unique(block_keys)) < blocks:
             raise ValueError("a block is there twice")
+        self.columns = grow_all(self._memory, self.columns, 0, rows + 4096)
+        for name, own in self.columns._asdict().items():
+            own[deep if name == "high" else slice(rows)] = columns[name]
         self._grow_blocks(max(blocks + 1, 256))
         self.num_blocks, self.num_rows = _add_blocks(self.blocks, block_keys), rows
         _place(self.blocks, self.columns, rows)
@@ -283,12 +275,24 @@ class VoxelStore:
 
     def occupied_rows(self) -> NDArray[np.int32]:
         """(V,) rows that hold points."""
-        return np.flatnonzero(self.columns.moments[: self.num_rows, 0]).astype(np.int32)
+        rows = np.arange(self.num_rows, dtype=np.int32)
+        return np.compress(self.num_points(rows) != 0, rows)
+
+    def num_points(self, rows: NDArray[Any]) -> NDArray[np.int64]:
+        """(V,) points that rows (V,) hold."""
+        out = np.empty(len(rows), np.int64)
+        _count_points(self.columns, rows, out)
+        return out
+
+    def moments(self, rows: NDArray[np.int32]) -> NDArray[np.int64]:
+        """(V, 10) of rows (V,): n, sum x, y, z, sum xx, xy, xz, yy, yz, zz, local ticks 0..1023."""
+        return sums_of(self.columns, rows)[:, :MOMENTS]
+
+    def views(self, rows: NDArray[np.int32]) -> NDArray[np.int64]:
+        """(V, 3) of rows (V,): sums of the quantised unit vectors towards the sensor."""
+        return sums_of(self.columns, rows)[:, MOMENTS:]
 
     def _apply(self, ticks: Ticks, sign: int) -> None:
-        if ticks.pose_hash >= 0 and not len(self.columns.poses):
-            poses = np.zeros((len(self.columns.block), 3), np.int64)
-            self.columns = self.columns._replace(poses=poses)
         done = 0
         while done < len(ticks.points):
             used = (self.num_blocks, self.num_rows, self._num_touched)
@@ -302,21 +306,18 @@ class VoxelStore:
         if self.num_blocks == len(self.blocks.keys):
             self._grow_blocks(2 * self.num_blocks)
         if self.num_rows == len(self.columns.block):
-            capacity = self.num_rows + max(self.num_rows // 2, 4096)
-            self.columns = Columns(
-                *(_grown(c, capacity, 0) if len(c) else c for c in self.columns)  # type: ignore[arg-type]
-            )
+            self.columns = grow_all(self._memory, self.columns, self.num_rows, 2 * self.num_rows)
         if self._num_touched == len(self._touched_rows):
             self._touched_rows = np.resize(self._touched_rows, 2 * self._num_touched)
 
     def _grow_blocks(self, capacity: int) -> None:
-        old = self.blocks
-        keys, values = rehash(old.keys, self.num_blocks, 4 << (capacity - 1).bit_length())
+        old, used = self.blocks, self.num_blocks
+        keys, values = rehash(old.keys, used, 4 << (capacity - 1).bit_length())
         self.blocks = Blocks(
             keys,
             values,
-            _grown(old.keys, capacity, 0),  # type: ignore[arg-type]
-            _grown(old.rows, capacity, -1),  # type: ignore[arg-type]
-            _grown(old.occupied, capacity, 0),  # type: ignore[arg-type]
-            _grown(old.neighbours, capacity, -1),  # type: ignore[arg-type]
+            *(self._memory.grown(c, used, capacity) for c in old[2:]),
         )
+
+
+__all__ = ["MOMENTS", "Columns", "VoxelStore", "observe", "shift_moments"]

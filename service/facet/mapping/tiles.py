@@ -14,11 +14,13 @@ from numpy.typing import NDArray
 from facet.mapping.blocks import CENTRE, pack, pack_all, unpack, unpack_all
 from facet.mapping.kernel import kernel
 from facet.mapping.membership import collect, inherit, shell
+from facet.mapping.memory import Heap, Memory
 from facet.mapping.merging import Limits, Nodes, merge_nodes
 from facet.mapping.normals import UNIT
 from facet.mapping.patches import PER_BLOCK, PatchField
 from facet.mapping.settings import BLOCK, STEPS, TILE
-from facet.mapping.store import MOMENTS, VoxelStore, shift_moments
+from facet.mapping.store import VoxelStore
+from facet.mapping.sums import MOMENTS, shift_moments
 
 SIDE = 8  # blocks per tile edge
 
@@ -188,7 +190,8 @@ def spread(tile_keys: NDArray[np.int64], block_keys: NDArray[np.int64]) -> NDArr
 class TileField:
     """All tiles, each regrouped only when a patch of it, or the tolerance, changed."""
 
-    def __init__(self) -> None:
+    def __init__(self, memory: Memory | None = None) -> None:
+        self._memory = memory or Heap()
         self.tiles: dict[int, Tile] = {}
         self.plane_of_patch = np.zeros((0, PER_BLOCK), np.int16)  # (B, 12) tile-plane in its tile
         self._blocks: dict[int, list[int]] = {}
@@ -252,9 +255,9 @@ class TileField:
         """Give new blocks to their tiles."""
         count = store.num_blocks
         if len(self.plane_of_patch) < count:
-            wider = np.zeros((len(store.blocks.keys), PER_BLOCK), np.int16)
-            wider[: len(self.plane_of_patch)] = self.plane_of_patch
-            self.plane_of_patch = wider
+            self.plane_of_patch = self._memory.grown(
+                self.plane_of_patch, self._num_blocks, len(store.blocks.keys)
+            )
         new = np.arange(self._num_blocks, count)
         for block, key in zip(new, tile_keys_of(store.blocks.keys[new]), strict=True):
             self._blocks.setdefault(int(key), []).append(int(block))
