@@ -30,9 +30,10 @@ class Layer(NamedTuple):
 
 EVERYTHING = Layer("facet.* facet_protocol.*", "*")
 SHELL = Layer(
-    "facet facet.admission facet.config facet.frames facet.mapping.* facet.outgoing facet.pipeline "
-    "facet.plausibility facet.resolution facet.sequences facet.sinks facet.sources.naming "
-    "facet.standing facet.status facet_protocol.*"
+    "facet facet.admission facet.config facet.corrections facet.firsts facet.frames "
+    "facet.mapping.* facet.outgoing facet.past facet.pipeline facet.plausibility facet.resolution "
+    "facet.sequences facet.sinks facet.sources.naming facet.standing facet.status "
+    "facet.trajectory facet_protocol.*"
 )
 WIRING = Layer(  # the threads of the running service: they join sources and sinks by hand
     f"{SHELL.ours} facet.intake facet.robots facet.session facet.sinks.* facet.sources.*"
@@ -59,11 +60,14 @@ LAYERS = {  # the longest name that fits counts
     "facet.simulate": Layer("facet.simulate.* facet_protocol.*", "numpy numba"),
     "facet.config": Layer("", "pydantic"),
     "facet.frames": Layer("facet_protocol.*", pure=True),
+    "facet.past": Layer("facet.sinks.log_file facet.sources.* facet_protocol.*"),
     "facet.resolution": Layer("facet.frames facet_protocol.*", pure=True),
     "facet.robots": Layer(
-        "facet.admission facet.config facet.sources.dialects facet.status facet_protocol.*"
+        "facet.admission facet.config facet.past facet.sources.dialects facet.status "
+        "facet_protocol.*"
     ),
     "facet.session": Layer("facet.config", "zenoh"),
+    "facet.trajectory": Layer("facet_protocol.messages", pure=True),
     "facet": SHELL,
     "facet.intake": WIRING,
     "facet.resume": Layer(f"{WIRING.ours} facet.checkpoint facet.cuts"),

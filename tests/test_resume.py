@@ -55,6 +55,8 @@ class Line:
 
     def __init__(self, folder: Path, resumed: Resumed | None = None, **options: Any) -> None:
         self.folder = folder
+        clock = iter(range(10**9, 10**18, 10**9))
+        self.recorder = Recorder(folder, "map", METADATA, clock=lambda: next(clock), **options)
         account = Account()
         if resumed is None:
             self.mapper = Mapper(SETTINGS)
@@ -71,8 +73,6 @@ class Line:
             self.pipeline.take_over(resumed.pipeline)
             self.pipeline.go_live()
             self.position, self.newest = resumed.position, resumed.newest
-        clock = iter(range(10**9, 10**18, 10**9))
-        self.recorder = Recorder(folder, "map", METADATA, clock=lambda: next(clock), **options)
 
     def write(self, envelope: Envelope, message: Any) -> None:
         if not isinstance(message, Scan):

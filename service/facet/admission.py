@@ -2,21 +2,23 @@
 
 from __future__ import annotations
 
-import hashlib
-import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
 
-import numpy as np
 from numpy.typing import NDArray
 
+from facet import corrections
+from facet.corrections import Corrections
+from facet.firsts import Firsts
 from facet.frames import Rank
+from facet.past import Past, at_once
 from facet.resolution import Resolution, Settled
-from facet.sequences import SequenceLedger
 from facet.sources.naming import (
     POSE_SCHEMAS,
     TRANSFORM_SCHEMAS,
+    is_correction,
     is_static,
     names_of,
     pose_frame,
@@ -24,8 +26,10 @@ from facet.sources.naming import (
 )
 from facet.standing import freeze_resolution, thaw_resolution
 from facet.status import Account
+from facet.trajectory import Trajectories
 from facet_protocol.codec import decode
 from facet_protocol.messages import (
+    Corrected,
     Envelope,
     ProtocolError,
     ResolvedPose,
@@ -36,10 +40,15 @@ from facet_protocol.messages import (
 )
 from facet_protocol.ros_definitions import ODOMETRY
 from facet_protocol.scans import decode_scan
-from facet_protocol.topics import PREFIX, RESOLVED_TOPIC, parse_pose_key, parse_scan_key
+from facet_protocol.topics import (
+    CORRECTED_TOPIC,
+    PREFIX,
+    RESOLVED_TOPIC,
+    parse_pose_key,
+    parse_scan_key,
+)
 from facet_protocol.wire import unwrap
 
-HASH_BYTES = 16
 WAIT_NS = 500_000_000  # of stamps: for a scan's pose, and between two poses
 WAIT_BYTES = 256 << 20  # of scans that wait
 
@@ -52,11 +61,21 @@ class Admitted(NamedTuple):
     resolved: ResolvedPose | None = None
 
 
+class Moved(NamedTuple):
+    """Scans to be moved, all of them: as they are in the map, and as they are to be. None when the
+    correction was refused; `corrected` is what became of it."""
+
+    envelope: Envelope
+    scans: tuple[tuple[Scan, Scan], ...]
+    corrected: Corrected
+
+
 class Admission:
     """Turns envelopes into scans, in log order, and counts what it leaves out under its reason.
 
-    `logged`: the log says with which poses scans were applied. What does not have its pose with it
-    waits for it in `Resolution`.
+    `logged`: the log says with which poses scans were applied, and what became of corrections. What
+    does not have its pose with it waits for it in `Resolution`, a correction for its points in
+    `Corrections`; `past` is where those are found.
     """
 
     def __init__(
@@ -68,40 +87,53 @@ class Admission:
         wait_ns: int = WAIT_NS,
         wait_bytes: int = WAIT_BYTES,
         logged: bool = False,
+        past: Past | None = None,
     ) -> None:
+        self.past = past or Past()
         self._account = account
         self._frame_id, self._reach_m = frame_id, reach_m
         self._resolution = Resolution(frame_id, wait_ns, wait_bytes, logged=logged)
-        self._applied = SequenceLedger()
-        self._unnumbered: set[bytes] = set()  # of scans without a sequence: hashes
+        self._firsts = Firsts()
+        self._trajectories = Trajectories()
+        self.corrections = Corrections(
+            frame_id,
+            self._firsts,
+            self._trajectories,
+            lambda envelope: self._decode(_inner(envelope)),
+            at_once(self.past),
+            logged=logged,
+        )
 
     def report_to(self, account: Account) -> None:
         """Count there from now on, also what waits."""
         self._account = account
-        for envelope in self._resolution.waiting():
+        for envelope in (*self._resolution.waiting(), *self.corrections.waiting()):
             account.arrive(source_of(envelope))
 
     def freeze(self) -> dict[str, NDArray[Any]]:
         """What it remembers, for a checkpoint."""
-        ledger = json.dumps(self._applied.freeze(), sort_keys=True).encode()
-        hashes = b"".join(sorted(self._unnumbered))
         return {
-            "ledger": np.frombuffer(ledger, np.uint8),
-            "unnumbered": np.frombuffer(hashes, np.uint8).reshape(-1, HASH_BYTES),
+            **self._firsts.freeze(),
+            **self._trajectories.freeze(),
+            **self.past.freeze(),
             **freeze_resolution(self._resolution),
         }
 
-    def thaw(self, frozen: Mapping[str, NDArray[Any]]) -> None:
-        """Remember what was frozen. Raises KeyError, TypeError, ValueError for anything else."""
-        self._applied = SequenceLedger.thaw(json.loads(frozen["ledger"].tobytes()))
-        hashes = frozen["unnumbered"].reshape(-1, HASH_BYTES)
-        self._unnumbered = {row.tobytes() for row in hashes}
+    def thaw(self, frozen: Mapping[str, NDArray[Any]], directory: Path) -> None:
+        """Remember what was frozen, of a log that lies in `directory` now. Raises KeyError,
+        TypeError, ValueError for anything else."""
+        self._firsts.thaw(frozen)
+        self._trajectories.thaw(frozen)
+        self.past.thaw(frozen, directory)
         thaw_resolution(self._resolution, frozen, lambda e: self._decode(_inner(e)))
 
-    def admit(self, envelope: Envelope) -> list[Admitted]:
-        """The scans to insert: this one, or such as have waited for this pose. Often none."""
-        if envelope.key == RESOLVED_TOPIC:
+    def admit(self, envelope: Envelope) -> Sequence[Admitted | Moved]:
+        """The scans to insert: this one, or such as have waited for this pose; or to be moved.
+        Often none."""
+        if envelope.key in (RESOLVED_TOPIC, CORRECTED_TOPIC):
             return self._confirm(envelope)
+        if is_correction(envelope):
+            return self._admit_correction(envelope)
         source = source_of(envelope)
         try:
             inner = _inner(envelope)
@@ -117,17 +149,32 @@ class Admission:
         """Scans that wait for their pose."""
         return len(self._resolution)
 
-    def finish(self) -> list[Admitted]:
-        """No message will come any more: what waits is placed now, or refused."""
-        return self._take(self._resolution.finish())
+    @property
+    def num_correcting(self) -> int:
+        """Corrections that wait for their points."""
+        return len(self.corrections)
 
-    def go_live(self) -> list[Admitted]:
-        """The log ends here: what it does not say is found from the poses that come."""
-        return self._take(self._resolution.go_live())
+    def go_on(self) -> Sequence[Moved]:
+        """Corrections whose points have come."""
+        return self._take_moved(self.corrections.go_on())
+
+    def finish(self, timeout_s: float | None = None) -> Sequence[Admitted | Moved]:
+        """No message will come any more: what waits for a pose is placed now, or refused; what
+        waits for points does so for as long as that, each."""
+        placed = self._take(self._resolution.finish())
+        if timeout_s is None:
+            return [*placed, *self._take_moved(self.corrections.go_live())]
+        return [*placed, *self._take_moved(self.corrections.go_on(timeout_s))]
+
+    def go_live(self) -> Sequence[Admitted | Moved]:
+        """The log ends here: what it does not say is found from the poses that come, and from
+        what it holds."""
+        placed = self._take(self._resolution.go_live())
+        return [*placed, *self._take_moved(self.corrections.go_live())]
 
     def _admit_scan(self, envelope: Envelope, inner: Envelope, source: str) -> list[Admitted]:
         scan = self._decode(inner)
-        if not self._is_first(envelope, scan.source):
+        if not self._firsts.is_first(envelope, scan.source):
             self._account.settle(source, "duplicate")
             return []
         if scan.renormalised:
@@ -184,14 +231,32 @@ class Admission:
             raise ProtocolError(f"{envelope.schema}: {text} A rule can say it", "wrong_frame")
         return (StampedTransform(message.stamp_ns, message.frame_id, child, message.pose),), ()
 
-    def _confirm(self, envelope: Envelope) -> list[Admitted]:
-        """The log says with which pose a scan was applied."""
+    def _admit_correction(self, envelope: Envelope) -> Sequence[Moved]:
+        source = source_of(envelope)
+        if envelope.sequence and not self._firsts.is_first(envelope, source):
+            self._account.settle(source, "duplicate")
+            return []
+        return self._take_moved(self.corrections.take(envelope))
+
+    def _confirm(self, envelope: Envelope) -> Sequence[Admitted | Moved]:
+        """The log says with which pose a scan was applied, or what became of a correction."""
         try:
             message = decode(envelope)
         except ProtocolError as error:
-            self._account.complain(RESOLVED_TOPIC, error.reason, str(error))
+            self._account.complain(envelope.key, error.reason, str(error))
             return []
+        if isinstance(message, Corrected):
+            return self._take_moved(self.corrections.confirm(message))
         return self._take(self._resolution.confirm(message)) if _is_resolved(message) else []
+
+    def _take_moved(self, settled: Iterable[corrections.Settled]) -> list[Moved]:
+        """Corrections that wait no longer; what was refused is counted."""
+        moved = []
+        for envelope, corrected, scans, error in settled:
+            if error is not None:
+                self._refuse(source_of(envelope), error)
+            moved.append(Moved(envelope, scans, corrected))
+        return moved
 
     def _take(self, settled: Iterable[Settled]) -> list[Admitted]:
         """What was placed, with the record of it; what was refused is counted."""
@@ -209,22 +274,13 @@ class Admission:
                 frame_id=self._frame_id,
                 pose=scan.pose,
             )
+            self._trajectories.note(scan.source, envelope.epoch, envelope.sequence, scan.pose)
             admitted.append(Admitted(envelope, scan, resolved))
         return admitted
 
     def _refuse(self, source: str, error: ProtocolError) -> None:
         self._account.settle(source, f"rejected.{error.reason}")
         self._account.complain(source, error.reason, str(error))
-
-    def _is_first(self, envelope: Envelope, source: str) -> bool:
-        if envelope.sequence:
-            return self._applied.note(source, envelope.epoch, envelope.sequence).is_new
-        stamp = envelope.stamp_ns.to_bytes(8, "little", signed=True)
-        digest = hashlib.blake2b(source.encode() + stamp, digest_size=HASH_BYTES)
-        digest.update(envelope.payload)
-        known = digest.digest() in self._unnumbered
-        self._unnumbered.add(digest.digest())
-        return not known
 
 
 def _inner(envelope: Envelope) -> Envelope:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator
 
-from facet.sources.naming import is_input, is_scan, names_of
+from facet.sources.naming import CORRECTION, is_correction, is_input, is_scan, names_of
 from facet_protocol import topics
 from facet_protocol.codec import decode
-from facet_protocol.messages import Cut, Envelope, ProtocolError, ResolvedPose
+from facet_protocol.messages import Corrected, Cut, Envelope, ProtocolError, ResolvedPose
 
 EVERY_NS = 200_000_000  # of log time, for a log that does not say
+RECORDS = (topics.RESOLVED_TOPIC, topics.CORRECTED_TOPIC)
 Identity = tuple[str, str, int, int, int]  # robot, sensor, epoch, sequence, stamp
 
 
@@ -25,8 +26,9 @@ def logged_cuts(envelopes: Iterable[Envelope], has_cuts: Callable[[], bool]) -> 
     """The messages of each update as the log cut them; of a log without cuts, every 0.2 s of it.
 
     Scans between the last scan that a cut names and the cut itself belong to the next update: they
-    were recorded while this one was under way. A scan that waited for its pose belongs to the cut
-    that follows the record of it. `has_cuts` is asked once the first scan was read.
+    were recorded while this one was under way. A scan that waited for its pose, and a correction,
+    belong to the cut that follows the record of it. `has_cuts` is asked once the first scan was
+    read.
     """
     waiting: list[Envelope] = []
     cuts: list[Cut] = []
@@ -67,8 +69,8 @@ def timed_cuts(envelopes: Iterable[Envelope], every_ns: int) -> Iterator[list[En
 
 
 def _is_applied(envelope: Envelope) -> bool:
-    """An input, or the record of a pose that was found for one."""
-    return is_input(envelope) or envelope.key == topics.RESOLVED_TOPIC
+    """An input, or the record of what became of one."""
+    return is_input(envelope) or envelope.key in RECORDS
 
 
 def _is_due(first: Envelope, envelope: Envelope, every_ns: int) -> bool:
@@ -87,26 +89,29 @@ def _cut(envelope: Envelope) -> Cut | None:
 
 def _split(waiting: list[Envelope], cuts: list[Cut]) -> tuple[list[Envelope], list[Envelope]]:
     """(applied before the cut, after it): up to the last scan that one of its rows names, or whose
-    pose was found before it, and the records of those poses."""
+    pose was found before it, or the last correction that was settled, and the records of both."""
     named = {(c.robot, c.sensor, c.epoch, c.sequence, c.stamp_ns) for c in cuts}
-    named |= {identity for e in waiting if (identity := _resolved_identity(e)) is not None}
+    named |= {identity for e in waiting if (identity := _recorded_identity(e)) is not None}
     end = 0
     for k, envelope in enumerate(waiting):
         identity = _identity(envelope)
-        if identity in named and is_scan(envelope):
+        if identity in named and (is_scan(envelope) or is_correction(envelope)):
             named.discard(identity)  # a duplicate further on was left out
             end = k + 1
-    records = [e for e in waiting[end:] if e.key == topics.RESOLVED_TOPIC]
-    return waiting[:end] + records, [e for e in waiting[end:] if e.key != topics.RESOLVED_TOPIC]
+    records = [e for e in waiting[end:] if e.key in RECORDS]
+    return waiting[:end] + records, [e for e in waiting[end:] if e.key not in RECORDS]
 
 
-def _resolved_identity(envelope: Envelope) -> Identity | None:
-    if envelope.key != topics.RESOLVED_TOPIC:
+def _recorded_identity(envelope: Envelope) -> Identity | None:
+    """Of the scan or correction that a record is about."""
+    if envelope.key not in RECORDS:
         return None
     try:
         message = decode(envelope)
     except ProtocolError:
         return None
+    if isinstance(message, Corrected):
+        return message.robot, CORRECTION, message.epoch, message.sequence, message.stamp_ns
     if not isinstance(message, ResolvedPose):
         return None
     return message.robot, message.sensor, message.epoch, message.sequence, message.stamp_ns

@@ -8,8 +8,10 @@ import time
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import replace
+from functools import partial
 
 from facet.outgoing import Outgoing
+from facet.past import Past, definitions_of
 from facet.sequences import SequenceLedger
 from facet.sinks import Message
 from facet.sinks.recorder import LogPosition, Recorder
@@ -91,7 +93,10 @@ class Intake:
         commit_s: float = 0.05,
         retry_s: float = 5.0,
         exit_on_failure: bool = False,
+        past: Past | None = None,
     ) -> None:
+        self._past = past  # is told where in the log scans lie
+        self._written_to: LogPosition | None = None
         self._inbox, self._recorder, self._durable = inbox, recorder, durable
         self._outgoing, self._account = outgoing, account
         self._commit_s, self._retry_s = commit_s, retry_s
@@ -261,7 +266,17 @@ class Intake:
             self._account.count("recorded", source)
             self._account.gauge("ack", envelope.sequence, source)
         if scans:
-            self._durable.put(scans, self._recorder.position)
+            position = self._recorder.position
+            self._note_past(scans, position)
+            self._durable.put(scans, position)
+
+    def _note_past(self, scans: list[Envelope], position: LogPosition) -> None:
+        last, self._written_to = self._written_to, position
+        if self._past is not None:
+            path = self._recorder.directory / position.file
+            start = last.offset if last is not None and last.file == position.file else 0
+            self._past.note(path, start, position.offset, scans)
+            self._past.define(path, partial(definitions_of, position.channels))
 
     def _fail(self, error: OSError) -> None:
         self._account.failure = str(error)

@@ -7,14 +7,16 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from facet.admission import Admission, Admitted
+from facet.admission import Admission, Admitted, Moved
 from facet.mapping.mapper import Mapper
+from facet.mapping.quantise import quantise
 from facet.outgoing import Outgoing
 from facet.plausibility import Plausibility
 from facet.sinks import Message, Sink
+from facet.sources.naming import source_of
 from facet.status import Account
 from facet_protocol import topics
-from facet_protocol.messages import Cut, Envelope, MapUpdate, Scan
+from facet_protocol.messages import Corrected, Cut, Envelope, MapUpdate, ResolvedPose, Scan
 
 Tile = tuple[int, int, int]
 
@@ -63,8 +65,8 @@ class Pipeline:
         self.is_stale = other.is_stale
 
     def insert(self, envelope: Envelope) -> bool:
-        """Take one message, without deriving anything; False when it puts nothing into the map: it
-        is left out, it waits for its pose, or it is a pose that no scan waits for."""
+        """Take one message, without deriving anything; False when it changes nothing in the map: it
+        is left out, it waits, or it is a pose that no scan waits for."""
         self.log_time_ns = max(self.log_time_ns, envelope.received_ns)
         return self._apply(self._admission.admit(envelope))
 
@@ -72,14 +74,47 @@ class Pipeline:
         """The log that was read ends here: what comes now is new."""
         self._apply(self._admission.go_live())
 
-    def _apply(self, admitted: Sequence[Admitted]) -> bool:
-        for envelope, scan, resolved in admitted:
-            self._insert(envelope, scan)
-            if resolved is not None:
-                stamp_ns, topic = resolved.stamp_ns, topics.RESOLVED_TOPIC
-                said = self._outgoing.address(topic, resolved, stamp_ns, self.log_time_ns)
-                self._emit((said,))
-        return bool(admitted)
+    def go_on(self) -> bool:
+        """Apply the corrections whose points have come from the log."""
+        return self._apply(self._admission.go_on())
+
+    @property
+    def is_settled(self) -> bool:
+        """The map is what the log says, up to the last message that was taken."""
+        return not self.is_stale and not self._admission.num_correcting
+
+    def _apply(self, admitted: Sequence[Admitted | Moved]) -> bool:
+        num_changes = 0
+        for one in admitted:
+            if isinstance(one, Moved):
+                self._move(one)
+                self._say(topics.CORRECTED_TOPIC, one.corrected)
+                num_changes += len(one.scans)
+                continue
+            self._insert(one.envelope, one.scan)
+            if one.resolved is not None:
+                self._say(topics.RESOLVED_TOPIC, one.resolved)
+            num_changes += 1
+        return num_changes > 0
+
+    def _say(self, topic: str, message: ResolvedPose | Corrected) -> None:
+        said = self._outgoing.address(topic, message, message.stamp_ns, self.log_time_ns)
+        self._emit((said,))
+
+    def _move(self, moved: Moved) -> None:
+        """Take scans out where they are, and put them in where they are to be: exactly."""
+        for old, new in moved.scans:
+            out = quantise(old, self._mapper.settings)
+            self._mapper.retract(old)
+            inserted = self._mapper.insert(new)
+            changes = Counter(inserted.rejected)
+            changes.subtract(out.rejected)
+            points = {f"points_rejected.{reason}": num for reason, num in changes.items()}
+            points["points_stored"] = inserted.points_stored - len(out.points)
+            self._account.settle(new.source, "scans_corrected", 0, {"scans_corrected": 1, **points})
+        if moved.scans:
+            self._account.settle(source_of(moved.envelope), "used_as_correction")
+            self.is_stale = True
 
     def _insert(self, envelope: Envelope, scan: Scan) -> None:
         inserted = self._mapper.insert(scan)
@@ -107,10 +142,10 @@ class Pipeline:
         self._send_points(update)
         return update
 
-    def finish(self) -> None:
-        """Settle what still waits for its pose; send what was held back: the last points, the last
-        scene."""
-        if self._apply(self._admission.finish()):
+    def finish(self, timeout_s: float | None = None) -> None:
+        """Settle what still waits for its pose, or, as long as that, for its points; send what was
+        held back: the last points, the last scene."""
+        if self._apply(self._admission.finish(timeout_s)):
             self.update()
         self._points_every_ns = min(self._points_every_ns, 1)
         self._emit(self._outgoing.finish(self.log_time_ns))

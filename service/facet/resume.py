@@ -33,12 +33,12 @@ from facet.mapping.frozen import freeze, thaw
 from facet.mapping.mapper import Mapper
 from facet.mapping.settings import MapSettings
 from facet.outgoing import Outgoing
+from facet.past import definitions_of
 from facet.pipeline import Pipeline
 from facet.robots import admission_of, dialects_of
-from facet.sinks.log_file import ChannelName, channel_metadata, schema_text
+from facet.sinks.log_file import ChannelName
 from facet.sinks.recorder import LogPosition, log_files
 from facet.sources.dialects import Dialects
-from facet.sources.mcap_definitions import Definitions, defined
 from facet.sources.mcap_stream import LogError, McapStream
 from facet.sources.naming import source_of
 from facet.sources.recording import envelope_of, is_replayed
@@ -208,7 +208,7 @@ def _from_checkpoint(
     resumed = _from_nothing(config, mapper)
     try:
         _check_files(header["log"], files)
-        resumed.admission.thaw(_part(checkpoint, ADMISSION))
+        resumed.admission.thaw(_part(checkpoint, ADMISSION), config.record.directory)
         log = header["log"]
         channels = tuple(_channel_name(row) for row in log["channels"])
         resumed.position = LogPosition(str(log["file"]), int(log["offset"]), channels)
@@ -266,25 +266,17 @@ def _envelopes(resumed: Resumed, files: Sequence[Path], dialects: Dialects) -> I
     first = names.index(position.file) if position is not None else 0
     for path in files[first:]:
         if position is not None and path.name == position.file:
-            stream = McapStream(path, position.offset, _definitions(position.channels))
+            stream = McapStream(path, position.offset, definitions_of(position.channels))
         else:
             stream = McapStream(path)
         with suppress(LogError):  # nothing of it can be read: said below
             for message in stream.messages():
                 envelope = envelope_of(message, dialects)
                 note_newest(resumed.newest, envelope)
+                resumed.admission.past.note_read(stream, envelope)
                 yield envelope
         if stream.damage.is_lossy:
             logger.warning("%s: %s; %s", path.name, stream.damage, "; ".join(stream.damage.notes))
-
-
-def _definitions(channels: Sequence[ChannelName]) -> Definitions:
-    """What the log defined before a position."""
-    return defined(
-        (topic, encoding, channel_metadata(name), schema, *schema_text(schema))
-        for name in channels
-        for topic, schema, encoding, _epoch, _high in [name]
-    )
 
 
 def set_aside(directory: Path, map_id: str) -> Path | None:

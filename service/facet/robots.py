@@ -7,6 +7,7 @@ from collections.abc import Mapping
 
 from facet.admission import Admission
 from facet.config import Config, ConfigError, RobotsSection
+from facet.past import Past
 from facet.sources.dialects import Dialects, key_pattern
 from facet.status import Account
 from facet_protocol.messages import ProtocolError, Rule
@@ -27,9 +28,14 @@ def dialects_of(robots: RobotsSection) -> Dialects:
 
 
 def admission_of(
-    config: Config, account: Account, reach_m: float, *, logged: bool = False
+    config: Config,
+    account: Account,
+    reach_m: float,
+    *,
+    logged: bool = False,
+    past: Past | None = None,
 ) -> Admission:
-    """What turns messages into scans, bounded as the settings say; `logged`: see there."""
+    """What turns messages into scans, bounded as the settings say; `logged`, `past`: see there."""
     return Admission(
         account,
         config.map.frame,
@@ -37,6 +43,7 @@ def admission_of(
         wait_ns=int(config.robots.wait_s * 1e9),
         wait_bytes=config.robots.wait_bytes,
         logged=logged,
+        past=past or Past(dialects_of(config.robots)),
     )
 
 

@@ -94,6 +94,14 @@ class SequenceLedger:
         self._late[source] += is_late
         return Noted(is_new, skipped, start + 1, is_late, is_restart, is_interleaved)
 
+    def find(self, source: str, epoch: int, sequence: int) -> int | None:
+        """The epoch in which a number has come, or None. An epoch of 0 that the source never had
+        is the one of its last message."""
+        epochs = self._seen.get(source, {})
+        if not epoch and epoch not in epochs:
+            epoch = self._current.get(source, 0)
+        return epoch if epoch in epochs and sequence in epochs[epoch] else None
+
     def freeze(self) -> dict[str, Any]:
         """All of it, as JSON knows it."""
         return {

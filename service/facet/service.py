@@ -7,7 +7,7 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Mapping
-from concurrent.futures import Future
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +26,7 @@ from facet.intake import DurableQueue, Intake
 from facet.keeper import Keeper
 from facet.mapping.mapper import Mapper
 from facet.outgoing import Outgoing
+from facet.past import Past
 from facet.pipeline import Pipeline
 from facet.resume import Newest, Resumed, hold, note_newest
 from facet.robots import admission_of, dialects_of
@@ -79,6 +80,10 @@ class Service:
             tally=self.account,
         )
         self._durable = DurableQueue(config.queue.max_bytes)
+        self._past = resumed.admission.past if resumed else Past(dialects_of(config.robots))
+        self._reading = ThreadPoolExecutor(
+            1, thread_name_prefix="past"
+        )  # of the log, for corrections
         self._outgoing = Outgoing(config.map.id, config.map.frame, time.time_ns)
         self.recorder = _recorder(config, mapper)
         self._intake = Intake(
@@ -90,6 +95,7 @@ class Service:
             commit_s=config.record.commit_ms * 1e-3,
             retry_s=config.record.retry_s,
             exit_on_failure=config.record.on_full == "exit",
+            past=self._past,
         )
         self._position: LogPosition | None = None  # all before it in the log is in the map
         self._newest: Newest = {}
@@ -129,6 +135,9 @@ class Service:
         self._keeper = Keeper(self._config.record, self.account, self._intake.is_logged)
         if self._resumed is not None:
             self._go_on(self._resumed)
+        self._admission.corrections.ask = lambda wanted: self._reading.submit(
+            self._past.read, wanted
+        )
         self._intake.start()
         self._mapping.start()
         self._reporting.start()
@@ -139,7 +148,8 @@ class Service:
 
     def _admit(self) -> Admission:
         if self._resumed is None:
-            return admission_of(self._config, self.account, self._mapper.settings.reach_m)
+            reach_m = self._mapper.settings.reach_m
+            return admission_of(self._config, self.account, reach_m, past=self._past)
         self._resumed.admission.report_to(self.account)
         return self._resumed.admission
 
@@ -171,6 +181,8 @@ class Service:
         self._running.set()
         self._durable.close()
         self._mapping.join(JOIN_S)
+        self._past.close()
+        self._reading.shutdown(wait=False, cancel_futures=True)
         self._reporting.join(1.0)
         self._say_status()
         self._answers.close()
@@ -183,7 +195,7 @@ class Service:
 
     def _keep_last(self) -> None:
         """The next start begins here; without it, it reads more of the log."""
-        if not self._pipeline.is_stale and self._position is not None:
+        if self._pipeline.is_settled and self._position is not None:
             with suppress(OSError):  # said and counted
                 self._keeper.save(self._hold(self._position))
 
@@ -193,7 +205,9 @@ class Service:
             while not self._stopping.is_set():
                 self._step(timeout_s=0.1)
             self._step(timeout_s=0.0)
-            self._pipeline.finish()
+            self._pipeline.finish(max(0.0, self._stop_at - time.monotonic()))
+            for envelope in self._admission.corrections.waiting():
+                self.account.settle(source_of(envelope), "not_applied")
         except Exception as error:  # a fault of ours: nothing after it could be trusted
             logger.exception("the mapper failed")
             self.fault = error
@@ -214,6 +228,7 @@ class Service:
                 continue
             note_newest(self._newest, envelope)
             self._pipeline.insert(envelope)
+        self._pipeline.go_on()
         if is_whole and self._durable.taken_to is not None:
             self._position = self._durable.taken_to
         if self._pipeline.is_stale and time.monotonic() <= self._stop_at:
@@ -223,7 +238,7 @@ class Service:
             self.account.gauge("update_ms", (time.monotonic() - started) * 1e3)
             self.account.gauge("map_lag_s", (time.time_ns() - self._pipeline.log_time_ns) * 1e-9)
             self.account.gauge("voxels", self._mapper.counts().voxels)
-        if self._position is not None and not self._pipeline.is_stale and self._keeper.is_due():
+        if self._position is not None and self._pipeline.is_settled and self._keeper.is_due():
             self._keeper.start(self._hold(self._position))
 
     def _hold(self, position: LogPosition) -> Checkpoint:
@@ -251,6 +266,7 @@ class Service:
         gauge = self.account.gauge
         gauge("queue_msgs", len(self._inbox) + len(self._durable))
         gauge("queue_bytes", self._inbox.num_bytes)
+        gauge("waiting_for_points", self._admission.num_correcting)
         gauge("waiting_for_pose", self._admission.num_waiting)
         gauge("foreign_ignored", self._inbox.num_ignored)
         gauge("recorded_bytes", self.recorder.committed_bytes)
@@ -293,6 +309,8 @@ class Service:
                 raise CommandError("nothing has been mapped yet")
             if self._pipeline.is_stale:
                 self._pipeline.update()
+            if not self._pipeline.is_settled:
+                raise CommandError("a correction is under way: ask again")
             return self._hold(self._position)
 
         try:

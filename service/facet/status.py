@@ -22,10 +22,11 @@ MAX_SOURCES = 256  # sources counted by name; a stranger cannot make the account
 BURST_S = 10.0  # one line of log per source and reason in this time
 
 # Why a good message is not applied: it was there already; another with its number was chosen; the
-# queue, the disk or the time did not suffice for it; it has no points, and said where a sensor is.
+# queue, the disk or the time did not suffice for it; it has no points, and said where a sensor is,
+# or was.
 LEFT_OUT = (
     *("duplicate", "conflict", "shed_overload", "too_large", "unrecorded", "not_applied"),
-    "used_as_pose",
+    *("used_as_pose", "used_as_correction"),
 )
 
 

@@ -13,14 +13,15 @@ import typer
 from facet.checkpoint import is_checkpoint, read_checkpoint
 from facet.commands.terminal import Exit, err, existing, megabytes, out, table
 from facet.config import Config
+from facet.firsts import Firsts
 from facet.robots import dialects_of, recorded_robots
 from facet.sequences import SequenceLedger
 from facet.sources.dialects import Dialects
-from facet.sources.naming import is_input, is_scan, source_of
+from facet.sources.naming import is_correction, is_input, is_scan, names_of, source_of
 from facet.sources.recording import Recording
 from facet_protocol import topics
 from facet_protocol.codec import decode
-from facet_protocol.messages import Envelope, Loss, ProtocolError
+from facet_protocol.messages import Corrected, Envelope, Loss, ProtocolError
 
 if TYPE_CHECKING:
     from facet.mapping.digest import Digest
@@ -49,6 +50,10 @@ class Contents:
     losses: Counter[str] = field(default_factory=Counter)  # what the log says of itself
     cuts: set[int] = field(default_factory=set)
     ledger: SequenceLedger = field(default_factory=SequenceLedger)
+    firsts: Firsts = field(default_factory=Firsts)
+    corrections: Counter[str] = field(default_factory=Counter)  # by robot
+    outcomes: Counter[str] = field(default_factory=Counter)  # of corrections, as the log says
+    num_moved: int = 0  # scans, by corrections
 
     def note(self, envelope: Envelope) -> None:
         """Count one message."""
@@ -63,9 +68,12 @@ class Contents:
         if is_scan(envelope):
             source = source_of(envelope)
             self.scans[source] += 1
-            if not self.ledger.note(source, envelope.epoch, envelope.sequence).is_new:
+            self.ledger.note(source, envelope.epoch, envelope.sequence)
+            if envelope.sequence and not self.firsts.is_first(envelope, source):
                 self.duplicates[source] += 1
-        elif envelope.key in (topics.CUT_TOPIC, topics.LOSS_TOPIC):
+        elif is_correction(envelope):
+            self.corrections[names_of(envelope)[0]] += 1
+        elif envelope.key in (topics.CUT_TOPIC, topics.LOSS_TOPIC, topics.CORRECTED_TOPIC):
             self._note_own(envelope)
 
     def _dialect(self, envelope: Envelope) -> str:
@@ -83,6 +91,9 @@ class Contents:
             return
         if isinstance(message, Loss):
             self.losses[message.reason] += message.count
+        elif isinstance(message, Corrected):
+            self.outcomes[message.reason or "applied"] += 1
+            self.num_moved += message.num_scans
         else:
             self.cuts.add(getattr(message, "revision", 0))
 
@@ -134,6 +145,8 @@ def _print_contents(recording: Recording, contents: Contents) -> None:
     ]
     table("sources", ("robot/sensor", "scans", "epochs", "missing", "duplicates"), sources)
     out.print(f"{len(contents.cuts):,} updates were cut")
+    if contents.corrections:
+        _print_corrections(contents)
     for reason, num in sorted(contents.losses.items()):
         out.print(f"{num:,} scans {reason}, as the log says itself")
     metadata = recording.metadata.get("facet", {})
@@ -146,6 +159,15 @@ def _print_contents(recording: Recording, contents: Contents) -> None:
             err.print(
                 f"damage: {path}: {damage}; `facet recover` writes what is whole to a new file"
             )
+
+
+def _print_corrections(contents: Contents) -> None:
+    robots = ", ".join(f"{num:,} of {name}" for name, num in sorted(contents.corrections.items()))
+    ends = ", ".join(f"{num:,} {name}" for name, num in sorted(contents.outcomes.items()))
+    out.print(
+        f"{contents.corrections.total():,} corrections ({robots}): {ends or 'not applied yet'}; "
+        f"{contents.num_moved:,} scans moved"
+    )
 
 
 def _checkpoint_info(path: Path) -> None:

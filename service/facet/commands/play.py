@@ -15,6 +15,7 @@ from facet.commands.terminal import err, existing, out, progress
 from facet.session import DEFAULT_ENDPOINT, client_settings, open_session
 from facet.sources.naming import (
     TRANSFORM_SCHEMAS,
+    is_correction,
     is_input,
     is_scan,
     is_static,
@@ -106,11 +107,14 @@ def _has_listener(session: zenoh.Session, key: str) -> bool:
 def play_scans(
     scans: Iterator[Envelope], publisher: RobotPublisher, robot: str | None, speed: float
 ) -> Iterator[int]:
-    """Publish each message at its stamp, `speed` times as fast (0: at once); counts the scans."""
+    """Publish each message at its stamp, `speed` times as fast (0: at once); counts the scans.
+    Corrections are left out."""
     first_ns: int | None = None
     started = time.monotonic()
     num = 0
     for envelope in scans:
+        if is_correction(envelope):
+            continue  # it names scans by numbers that they do not get again
         stamp_ns = envelope.stamp_ns or envelope.received_ns
         first_ns = stamp_ns if first_ns is None else first_ns
         if speed:
@@ -137,6 +141,7 @@ def play(
     shared_memory: Annotated[bool, typer.Option(help="Large scans by shared memory.")] = True,
 ) -> None:
     """Publish a recording over Zenoh, as the robot would; of ROS 2 too, with its transforms.
+    Scans get new numbers, so corrections of poses, which name the old ones, are not sent.
 
     \b
     facet run &                                    # somebody has to listen

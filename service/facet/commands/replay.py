@@ -24,6 +24,7 @@ from facet.commands.terminal import Exit, InputError, err, existing, out, progre
 from facet.config import Config, load_config
 from facet.cuts import logged_cuts, timed_cuts
 from facet.outgoing import Outgoing
+from facet.past import Past
 from facet.robots import admission_of, dialects_of, recorded_robots, says_poses
 from facet.sequences import SequenceLedger
 from facet.sinks import Sink
@@ -90,14 +91,15 @@ def replay_log(
     """Rebuild a map from logs. `sinks` see what those of a running service see."""
     head = Recording(existing(logs)).head()
     config = _as_recorded(config, head)
-    recording = Recording(logs, dialects_of(config.robots))
+    past = Past(dialects_of(config.robots))
+    recording = Recording(logs, dialects_of(config.robots), past.note_read)
     mapper = make_mapper(config, recorded_settings(head))
     account = Account()
     from facet.pipeline import Pipeline
 
     pipeline = Pipeline(
         mapper,
-        admission_of(config, account, mapper.settings.reach_m, logged=says_poses(head)),
+        admission_of(config, account, mapper.settings.reach_m, logged=says_poses(head), past=past),
         account,
         sinks,
         Outgoing(config.map.id, config.map.frame),

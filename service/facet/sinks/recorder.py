@@ -99,6 +99,10 @@ class Recorder:
         return durable
 
     @property
+    def directory(self) -> Path:
+        return self._directory
+
+    @property
     def position(self) -> LogPosition:
         """Where the last commit ended."""
         return self._position

@@ -24,7 +24,7 @@ from facet.sources.naming import is_input, is_static, names_of, source_of
 from facet_protocol import attachment
 from facet_protocol.messages import Envelope, Loss, ProtocolError
 from facet_protocol.ros_definitions import TRANSFORMS
-from facet_protocol.topics import PREFIX, poses_keys, scans_key
+from facet_protocol.topics import PREFIX, corrections_key, poses_keys, scans_key
 
 STATIC_KEYS = ("**/tf_static", "**/tf_static/tf2_msgs::msg::dds_::TFMessage_/*")
 
@@ -168,7 +168,7 @@ class Inbox:
 
 
 class LiveSource:
-    """Subscribes to every scan and pose of a map's robots, whatever they speak.
+    """Subscribes to every scan, pose and correction of a map's robots, whatever they speak.
 
     What a stall made us miss on Facet's own keys is asked for again; static transforms are asked
     for when we come late. `keys` are the foreign keys that are listened to: what is recognised
@@ -188,7 +188,7 @@ class LiveSource:
         self._patterns = [key_pattern(key) for key in keys]
         static = poses_keys(map_id, static=True)
         self._closers: list[Callable[[], object]] = []
-        for key in (scans_key(map_id), *poses_keys(map_id), *static):
+        for key in (scans_key(map_id), corrections_key(map_id), *poses_keys(map_id), *static):
             self._subscribe(key, self._take_native, with_history=key in static)
         if keys:
             tokens = zenoh.handlers.Callback(self._note_token, indirect=False)

@@ -20,6 +20,12 @@ class Definitions:
         self.schemas: dict[int, Schema] = {}
         self.num_bytes = 0
 
+    def copy(self) -> Definitions:
+        """Another one that knows the same."""
+        other = Definitions()
+        other.channels, other.schemas = dict(self.channels), dict(self.schemas)
+        return other
+
     def read(self, opcode: int, content: bytes) -> None:
         """Take a schema or a channel. Raises ValueError for another of a known id, and for too
         much."""

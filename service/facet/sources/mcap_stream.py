@@ -108,6 +108,7 @@ class McapStream:
         self.num_chunks = 0
         self.num_unchecked = 0  # messages that no checksum vouches for
         self.is_finished = False  # the footer was there
+        self.offset = start  # of the record in progress
         self._start = start
         self._definitions = known or Definitions()
         self._statistics: Statistics | None = None
@@ -116,6 +117,11 @@ class McapStream:
         self._search_from = start  # behind the last record whose length is known to be right
         self._crc: int | None = 0  # of the file so far, while it has no chunks, and was all read
 
+    @property
+    def definitions(self) -> Definitions:
+        """Known so far."""
+        return self._definitions
+
     def messages(self) -> Iterator[LogMessage]:
         """Every message of every whole chunk. Raises LogError when it is no MCAP file at all."""
         self._size = self.path.stat().st_size
@@ -123,6 +129,7 @@ class McapStream:
             self._read_summary(file)
             at = yield from self._begin(file)
             while at < self._size and not self.is_finished:
+                self.offset = at
                 at = yield from self._record(file, at)
         if not self.is_finished and not self.damage:
             self.damage.add(self._size, 0, "the file was not finished: it is cut off here")

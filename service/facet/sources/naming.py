@@ -9,6 +9,7 @@ from facet_protocol.messages import Envelope, ProtocolError
 from facet_protocol.ros_definitions import ROS_POSES, ROS_TRANSFORMS
 from facet_protocol.scans import SCAN_SCHEMAS
 
+CORRECTION = "@correction"  # in place of a sensor's name: no sensor has this sign in its own
 FOREIGN_ROBOT = "robot"  # who drove, where the topic does not say
 TRANSFORM_SCHEMAS = (*ROS_TRANSFORMS, "foxglove.FrameTransform", "foxglove.FrameTransforms")
 POSE_SCHEMAS = (*ROS_POSES, "foxglove.PoseInFrame")  # of what, only a rule or the key says
@@ -21,6 +22,8 @@ def robot_and_sensor(key: str) -> tuple[str, str]:
     try:
         if topics.is_pose_key(key):
             return topics.parse_pose_key(key)
+        if topics.is_correction_key(key):
+            return topics.parse_correction_key(key)[1], CORRECTION
         names = topics.parse_scan_key(key)
     except ProtocolError:
         sensor = re.sub(r"[^A-Za-z0-9_-]+", "_", key).strip("_")[:64] or "scan"
@@ -46,12 +49,19 @@ def source_of(origin: Envelope | str) -> str:
 
 def is_scan(envelope: Envelope) -> bool:
     """Whether it is a scan: our own points (`/facet/points`) are clouds too, but no scans."""
-    return envelope.schema in SCAN_SCHEMAS and not _is_own(envelope)
+    if envelope.schema not in SCAN_SCHEMAS:
+        return False
+    return not _is_own(envelope) and not is_correction(envelope)
+
+
+def is_correction(envelope: Envelope) -> bool:
+    """Whether it moves scans that came before."""
+    return topics.is_correction_key(envelope.key)
 
 
 def is_input(envelope: Envelope) -> bool:
-    """Whether the map is made of it: a scan, or what says where its sensor is."""
-    if is_scan(envelope):
+    """Whether the map is made of it: a scan, or what says where its sensor is, or was."""
+    if is_scan(envelope) or is_correction(envelope):
         return True
     if _is_own(envelope):
         return False

@@ -15,9 +15,15 @@ from facet_protocol.messages import Envelope
 class Recording:
     """The messages of one or more MCAP files, in the order given. Iterate it once."""
 
-    def __init__(self, paths: Sequence[Path], dialects: Dialects | None = None) -> None:
-        """`dialects`: with rules for topics that do not say what they are."""
-        self._dialects = dialects or Dialects()
+    def __init__(
+        self,
+        paths: Sequence[Path],
+        dialects: Dialects | None = None,
+        on_message: Callable[[McapStream, Envelope], object] = lambda stream, envelope: None,
+    ) -> None:
+        """`dialects`: with rules for topics that do not say what they are. `on_message` is told
+        where each message is read."""
+        self._dialects, self._on_message = dialects or Dialects(), on_message
         self.paths = [file for path in paths for file in _files(path)]
         self.damage: dict[Path, Damage] = {}
         self.metadata: dict[str, dict[str, str]] = {}  # of the file being read, by name
@@ -30,7 +36,9 @@ class Recording:
             for message in stream.messages():
                 self.metadata.update((m.name, m.metadata) for m in stream.metadata)
                 stream.metadata.clear()
-                yield envelope_of(message, self._dialects, is_own="facet" in self.metadata)
+                envelope = envelope_of(message, self._dialects, is_own="facet" in self.metadata)
+                self._on_message(stream, envelope)
+                yield envelope
             self.metadata.update((m.name, m.metadata) for m in stream.metadata)
 
     def head(self) -> dict[str, str]:
@@ -81,7 +89,7 @@ def is_replayed(envelope: Envelope) -> bool:
     return is_input(envelope) or envelope.key in _READ
 
 
-_READ = (topics.CUT_TOPIC, topics.LOSS_TOPIC, topics.RESOLVED_TOPIC)
+_READ = (topics.CUT_TOPIC, topics.LOSS_TOPIC, topics.RESOLVED_TOPIC, topics.CORRECTED_TOPIC)
 
 
 def paced(
