@@ -121,6 +121,13 @@ class Credentials(Section):
     private_key: Path | None = None
 
 
+class MemorySection(Section):
+    """How much memory the service may hold. The map's columns then lie in files of the log's
+    folder, and their cold pages go to the disk; None: all in memory."""
+
+    max_ram_mb: int | None = Field(default=None, ge=512)  # MiB, of the whole process
+
+
 class QueueSection(Section):
     """How much may wait between the network and the log. Half full, the network waits for a while;
     full, the oldest is shed, and counted."""
@@ -184,6 +191,7 @@ class Config(Section):
     mapping: MappingSection = MappingSection()
     network: NetworkSection = NetworkSection()
     robots: RobotsSection = RobotsSection()
+    memory: MemorySection = MemorySection()
     queue: QueueSection = QueueSection()
     record: RecordSection = RecordSection()
     publish: PublishSection = PublishSection()

@@ -31,6 +31,7 @@ from facet.config import Config
 from facet.cuts import logged_cuts
 from facet.mapping.frozen import freeze, thaw
 from facet.mapping.mapper import Mapper
+from facet.mapping.memory import Memory
 from facet.mapping.settings import MapSettings
 from facet.outgoing import Outgoing
 from facet.past import definitions_of
@@ -140,13 +141,15 @@ def _sync(path: Path) -> None:
         os.close(fd)
 
 
-def thaw_checkpoint(path: Path, settings: MapSettings | None = None) -> tuple[Checkpoint, Mapper]:
+def thaw_checkpoint(
+    path: Path, settings: MapSettings | None = None, memory: Memory | None = None
+) -> tuple[Checkpoint, Mapper]:
     """A checkpoint and its map. Raises CheckpointError, OSError."""
     checkpoint = read_checkpoint(path)
     header = checkpoint.header
     try:
         settings = settings or MapSettings(**header["settings"])
-        mapper = thaw(_part(checkpoint, MAP), settings, header["map"])
+        mapper = thaw(_part(checkpoint, MAP), settings, header["map"], memory)
     except (ValueError, TypeError, LookupError, AttributeError) as error:
         raise CheckpointError(path, f"it does not fit together ({error})") from error
     return checkpoint, mapper
@@ -168,7 +171,7 @@ def resume(config: Config, mapper: Mapper, stop: Callable[[], bool] = lambda: Fa
     started = time.monotonic()
     for path in checkpoint_paths(directory, map_id) if files else ():
         try:
-            resumed = _from_checkpoint(path, config, mapper.settings, files)
+            resumed = _from_checkpoint(path, config, mapper, files)
         except FileNotFoundError:
             continue
         except (CheckpointError, OSError) as error:
@@ -197,13 +200,11 @@ def _from_nothing(config: Config, mapper: Mapper) -> Resumed:
     return Resumed(mapper, admission, Pipeline(mapper, admission, account, (), outgoing))
 
 
-def _from_checkpoint(
-    path: Path, config: Config, settings: MapSettings, files: Sequence[Path]
-) -> Resumed:
+def _from_checkpoint(path: Path, config: Config, new: Mapper, files: Sequence[Path]) -> Resumed:
     """The map of a checkpoint. Raises CheckpointError unless it is of this log and settings."""
-    checkpoint, mapper = thaw_checkpoint(path, settings)
+    checkpoint, mapper = thaw_checkpoint(path, new.settings, new.memory)
     header = checkpoint.header
-    if header["origin"] != origin(settings, config):
+    if header["origin"] != origin(new.settings, config):
         raise CheckpointError(path, "it was made by another version, or with other settings")
     resumed = _from_nothing(config, mapper)
     try:

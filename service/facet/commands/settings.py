@@ -13,6 +13,7 @@ from facet.config import Config, ConfigError
 
 if TYPE_CHECKING:
     from facet.mapping.mapper import Mapper
+    from facet.paging import PagedMemory
 
 logger = logging.getLogger(__name__)
 
@@ -40,7 +41,15 @@ def make_mapper(config: Config, recorded: Mapping[str, Any] | None = None) -> Ma
         settings = MapSettings(**{**repeated, **config.mapping.given()})
     except (TypeError, ValueError) as error:
         raise ConfigError(str(error)) from error
-    return Mapper(settings, config.map.id)
+    return Mapper(settings, config.map.id, _memory(config))
+
+
+def _memory(config: Config) -> PagedMemory | None:
+    """Room for the map's columns; None: plain memory."""
+    from facet.paging import MIB, PagedMemory
+
+    limit = config.memory.max_ram_mb
+    return PagedMemory(config.record.directory, limit * MIB) if limit is not None else None
 
 
 def recorded_settings(head: Mapping[str, str]) -> dict[str, Any]:

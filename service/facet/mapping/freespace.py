@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from facet.mapping.blocks import Int64Array, find, hash_key, pack, put, rehash, unpack
 from facet.mapping.kernel import kernel
-from facet.mapping.memory import Heap, Memory
+from facet.mapping.memory import Heap, Memory, copied
 from facet.mapping.quantise import Ticks
 from facet.mapping.settings import TICKS
 
@@ -115,7 +115,8 @@ class FreeSpace:
 
     def freeze(self) -> tuple[Int64Array, NDArray[np.int32]]:
         """Copies of block keys (B,) and their cells' counts (B, 512)."""
-        return self._keys[: self.num_blocks].copy(), self._counts[: self.num_blocks].copy()
+        counts = copied(self._memory, self._counts, self.num_blocks)
+        return self._keys[: self.num_blocks].copy(), counts
 
     def restore(self, keys: Int64Array, counts: NDArray[np.int32]) -> None:
         """Become what was frozen. Raises ValueError for what does not fit together."""

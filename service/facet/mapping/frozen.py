@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from facet.mapping.mapper import Mapper
+from facet.mapping.memory import Memory, copied
 from facet.mapping.normals import Normals
 from facet.mapping.planes import FREE
 from facet.mapping.settings import MapSettings
@@ -32,7 +33,7 @@ def freeze(mapper: Mapper) -> dict[str, NDArray[Any]]:
     rows, keys = store.num_rows, sorted(tiles)
     arrays = {f"voxel/{name}": column for name, column in store.freeze().items()}
     normals = mapper._normals.normals._asdict()
-    arrays.update((f"normal/{name}", c[:rows].copy()) for name, c in normals.items())
+    arrays.update((f"normal/{name}", copied(mapper.memory, c, rows)) for name, c in normals.items())
     arrays["block/keys"] = store.blocks.keys[: store.num_blocks].copy()
     arrays["free/keys"], arrays["free/counts"] = mapper._free.freeze()
     arrays["tile/keys"] = np.array(keys, np.int64)
@@ -43,11 +44,13 @@ def freeze(mapper: Mapper) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def thaw(arrays: Arrays, settings: MapSettings, map_id: str) -> Mapper:
+def thaw(
+    arrays: Arrays, settings: MapSettings, map_id: str, memory: Memory | None = None
+) -> Mapper:
     """The map that was frozen: the same digest, ids and future updates.
 
     Raises ValueError where the arrays do not fit together."""
-    mapper = Mapper(settings, map_id)
+    mapper = Mapper(settings, map_id, memory)
     try:
         mapper._store.restore(_part(arrays, "voxel/"), arrays["block/keys"])
         mapper._normals.restore(mapper._store, Normals(**_part(arrays, "normal/")))

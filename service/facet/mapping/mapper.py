@@ -70,12 +70,12 @@ class Mapper:
         self.revision = 0
         self.work: dict[str, int] = {}
         self.changed_tiles: list[TileIndex] = []
-        self._memory = memory or Heap()
-        self._store = VoxelStore(self._memory)
-        self._free = FreeSpace(self._memory)
-        self._normals = NormalField(self.settings, self._memory)
-        self._patches = PatchField(self.settings, self._memory)
-        self._tiles = TileField(self._memory)
+        self.memory = memory or Heap()
+        self._store = VoxelStore(self.memory)
+        self._free = FreeSpace(self.memory)
+        self._normals = NormalField(self.settings, self.memory)
+        self._patches = PatchField(self.settings, self.memory)
+        self._tiles = TileField(self.memory)
         self._bends = Bends(self.settings, self._store, self._normals, self._patches, self._tiles)
         self._contours = ContourField(self.settings)
         self._identity = Identity()
@@ -129,7 +129,7 @@ class Mapper:
             "planes_changed": len(updated),
         }
         self.revision += 1
-        self._memory.rest()
+        self.memory.rest()
         return MapUpdate(
             map_id=self.map_id,
             revision=self.revision,

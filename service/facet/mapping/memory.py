@@ -1,17 +1,19 @@
 """Where columns live: zeroed arrays that grow. The core only asks; the shell may hand it memory
-that goes to disk when it is cold.
+whose cold pages go to disk.
 
 What was never written must cost nothing, so a column's empty value is zero, or is written when its
 row comes into use; then the room that a column has in reserve is free."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 Column = NDArray[Any]
+CHUNK = 1 << 20  # bytes that are looked at at a time
 C = TypeVar("C", bound=tuple[Any, ...])
 
 
@@ -32,13 +34,37 @@ class Heap:
     def grown(self, column: Column, used: int, capacity: int) -> Column:
         """A copy, see `Memory`."""
         out = np.zeros((capacity, *column.shape[1:]), column.dtype)
-        out[:used] = column[:used]
+        for part in _written(column[:used]):  # a copy of zeros would take memory
+            out[part] = column[part]
         return out
 
     def rest(self) -> None:
         """Nothing goes."""
 
 
+def copied(memory: Memory, column: Column, used: int) -> Column:
+    """A copy (used, ...) of the first rows of a column, in the same kind of memory."""
+    out = memory.grown(np.zeros((0, *column.shape[1:]), column.dtype), 0, used)
+    for part in _written(column[:used]):
+        out[part] = column[part]
+    return out
+
+
 def grow_all(memory: Memory, columns: C, used: int, capacity: int) -> C:
     """The same named tuple of columns, each grown."""
     return type(columns)(*(memory.grown(c, used, capacity) for c in columns))
+
+
+def clear(column: Column) -> None:
+    """Make a column zero without touching what is."""
+    for part in _written(column):
+        column[part] = 0
+
+
+def _written(column: Column) -> Iterator[slice]:
+    """The parts of a column that are not all zero."""
+    step = max(1, CHUNK * len(column) // max(1, column.nbytes))
+    for start in range(0, len(column), step):
+        part = slice(start, min(start + step, len(column)))
+        if column[part].any():
+            yield part

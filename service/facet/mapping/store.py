@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from facet.mapping.blocks import Blocks, add_block, find, pack, rehash, unpack_all
 from facet.mapping.kernel import kernel
-from facet.mapping.memory import Heap, Memory, grow_all
+from facet.mapping.memory import Heap, Memory, copied, grow_all
 from facet.mapping.quantise import VIEW, Ticks
 from facet.mapping.settings import BLOCK, TICKS
 from facet.mapping.sums import (
@@ -218,7 +218,11 @@ class VoxelStore:
     def freeze(self) -> dict[str, NDArray[Any]]:
         """Copies of the columns, of the high parts only where they are in use."""
         rows = self.num_rows
-        columns = {n: c[:rows].copy() for n, c in self.columns._asdict().items() if n != "high"}
+        columns = {
+            name: copied(self._memory, column, rows)
+            for name, column in self.columns._asdict().items()
+            if name != "high"
+        }
         deep = np.flatnonzero(columns["flags"] & DEEP).astype(np.int32)
         return columns | {"deep": deep, "high": self.columns.high[deep]}
 
