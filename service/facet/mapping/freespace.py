@@ -13,24 +13,23 @@ from facet.mapping.settings import TICKS
 
 CELL = 4  # voxels per cell edge
 SHIFT = 12  # ticks to cells: 2^12 = CELL * TICKS
-BEAMS_OF = 8  # of a cloud's beams one in so many is followed, chosen by a hash of its end
+BEAMS_OF = 8  # of a cloud's beams one in so many, a power of two, is followed: by a hash of its end
+FAR = np.int64(1) << 62  # an axis whose last cell is reached goes no farther
 FIRST_BLOCKS = 1024  # capacity to begin with
 
 assert 1 << SHIFT == CELL * TICKS
 
 
 @kernel
-def _count(table, counts, keys, num_blocks, i, j, k, sign):  # type: ignore[no-untyped-def]
-    """Add `sign` to a cell; returns the number of blocks."""
-    key = pack(i >> 3, j >> 3, k >> 3)
-    block = find(table[0], table[1], key)
+def _block(table, keys, num_blocks, key):  # type: ignore[no-untyped-def]
+    """The block `key`, a new one where there is none; and the number of blocks."""
+    block = np.int64(find(table[0], table[1], key))
     if block < 0:
         block = num_blocks
         put(table[0], table[1], key, block)
         keys[block] = key
         num_blocks += 1
-    counts[block, (i & 7) + 8 * (j & 7) + 64 * (k & 7)] += sign
-    return num_blocks
+    return block, num_blocks
 
 
 @kernel
@@ -46,22 +45,33 @@ def _pass(table, counts, keys, num_blocks, a, b, sign, ends):  # type: ignore[no
     n1 = ((j + 1) << SHIFT) - a[1] if d1 > 0 else a[1] - (j << SHIFT) + 1
     n2 = ((k + 1) << SHIFT) - a[2] if d2 > 0 else a[2] - (k << SHIFT) + 1
     l0, l1, l2 = abs(d0), abs(d1), abs(d2)
-    steps = abs(ei - i) + abs(ej - j) + abs(ek - k)
-    for _ in range(steps):
-        num_blocks = _count(table, counts, keys, num_blocks, i, j, k, sign)
-        left0, left1, left2 = i != ei, j != ej, k != ek
-        first0 = left0 and (not left1 or n0 * l1 <= n1 * l0) and (not left2 or n0 * l2 <= n2 * l0)
-        if first0:
+    e01, e02, e12 = n0 * l1 - n1 * l0, n0 * l2 - n2 * l0, n1 * l2 - n2 * l1  # <= 0: the first axis
+    if i == ei:
+        e01, e02 = FAR, FAR
+    if j == ej:
+        e01, e12 = -FAR, FAR
+    if k == ek:
+        e02, e12 = -FAR if i != ei else FAR, -FAR
+    last, block = np.int64(-1), np.int64(-1)
+    l0, l1, l2 = l0 << SHIFT, l1 << SHIFT, l2 << SHIFT
+    for _ in range(abs(ei - i) + abs(ej - j) + abs(ek - k)):
+        key = pack(i >> 3, j >> 3, k >> 3)
+        if key != last:
+            block, num_blocks = _block(table, keys, num_blocks, key)
+            last = key
+        counts[block, (i & 7) + 8 * (j & 7) + 64 * (k & 7)] += sign
+        if e01 <= 0 and e02 <= 0:
             i += s0
-            n0 += 1 << SHIFT
-        elif left1 and (not left2 or n1 * l2 <= n2 * l1):
+            e01, e02 = (e01 + l1, e02 + l2) if i != ei else (FAR, FAR)
+        elif e12 <= 0:
             j += s1
-            n1 += 1 << SHIFT
+            e01, e12 = (e01 - l0, e12 + l2) if j != ej else (-FAR, FAR)
         else:
             k += s2
-            n2 += 1 << SHIFT
+            e02, e12 = (e02 - l0, e12 - l1) if k != ek else (-FAR, -FAR)
     if not ends:
-        num_blocks = _count(table, counts, keys, num_blocks, i, j, k, sign)
+        block, num_blocks = _block(table, keys, num_blocks, pack(i >> 3, j >> 3, k >> 3))
+        counts[block, (i & 7) + 8 * (j & 7) + 64 * (k & 7)] += sign
     return num_blocks
 
 
@@ -82,7 +92,7 @@ def _pass_all(table, counts, keys, num_blocks, sensor, points, start, every, sig
         mixed = hash_key(
             points[p, 0] * 73856093 ^ points[p, 1] * 19349663 ^ points[p, 2] * 83492791
         )
-        if every > 1 and mixed % every != 0:
+        if mixed & (every - 1) != 0:
             continue
         most = 3 + _blocks_apart(sensor, points[p])  # that this beam can add
         if num_blocks + most > counts.shape[0]:
