@@ -22,63 +22,90 @@ from facet.mapping.settings import ALPHA2
 CELLS = 64  # cells of a (u, v) tile's edge; a cell is one voxel, 8 x 8 grid points, one word
 HALO = 11  # cells: a point within 2 alpha is at most so far away
 SIDE = CELLS + 2 * HALO  # cells of a window's edge: a tile with its halo
-SPAN = math.isqrt(4 * ALPHA2)  # largest coordinate difference within 2 alpha
+WIDE = 8 * HALO + 7  # largest coordinate difference between points of cells so far apart
 FEW = 16  # tiles that are not worth waking other threads for
 _FULL = 2.0 * math.pi
+_SLACK = 1e-6  # radians that a span is longer than it must be
 
 
-def _tables() -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """By (dv, du) + SPAN: where the arc of disc centres that hold the point begins and how long it
-    is (negative: out of reach). And the cells round a cell, nearest first, as (dv, du)."""
-    d = np.arange(-SPAN, SPAN + 1, dtype=np.float64)
+def _arcs() -> NDArray[np.float64]:
+    """By (dv, du) + WIDE: where the arc of disc centres that hold the point begins, where it ends
+    (both in [0, 2 pi)) and how long it is (negative: out of reach)."""
+    d = np.arange(-WIDE, WIDE + 1, dtype=np.float64)
     dv, du = np.meshgrid(d, d, indexing="ij")
     distance2 = du * du + dv * dv
     inside = (distance2 > 0) & (distance2 < 4 * ALPHA2)
     half = np.arccos(np.where(inside, np.sqrt(distance2) / (2.0 * math.sqrt(ALPHA2)), 0.0))
-    begin = np.mod(np.arctan2(dv, du) - half, _FULL)
-    length = np.where(inside, 2.0 * half, -1.0)
+    middle = np.arctan2(dv, du)
+    begin, end = (np.mod(middle + side * half, _FULL) for side in (-1.0, 1.0))
+    return np.stack([begin, end, np.where(inside, 2.0 * half, -1.0)], axis=-1)
+
+
+def _cells(arcs: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The cells round a cell, nearest first, as (dv, du); and of each where the arcs of all points
+    that it may hold begin, and how long they are together."""
     c = np.arange(-HALO, HALO + 1)
     cv, cu = (a.ravel() for a in np.meshgrid(c, c, indexing="ij"))
-    gap = np.maximum(np.abs(cv) - 1, 0) ** 2 + np.maximum(np.abs(cu) - 1, 0) ** 2
-    near = gap * 64 < 4 * ALPHA2
+    gap = [np.maximum(8 * np.abs(cell) - 7, 0) for cell in (cv, cu)]
+    near = gap[0] ** 2 + gap[1] ** 2 < 4 * ALPHA2
     order = np.argsort((cv**2 + cu**2)[near], kind="stable")
-    return begin, length, np.stack([cv[near], cu[near]], axis=1)[order].astype(np.int64)
+    around = np.stack([cv[near], cu[near]], axis=1)[order].astype(np.int64)
+    spans = np.empty((len(around), 2))
+    for span, (dv, du) in zip(spans, around.tolist(), strict=True):
+        v, u = 8 * dv + WIDE, 8 * du + WIDE
+        own = arcs[v - 7 : v + 8, u - 7 : u + 8].reshape(-1, 3)
+        own = own[own[:, 2] > 0.0]
+        middle = math.atan2(dv, du) - math.pi
+        begin = np.mod(own[:, 0] + own[:, 2] / 2.0 - middle, _FULL) - own[:, 2] / 2.0
+        low, high = float(begin.min()), float((begin + own[:, 2]).max())
+        span[:] = (middle + low - _SLACK) % _FULL, high - low + 2.0 * _SLACK
+    return around, spans
 
 
-_BEGIN, _LENGTH, _AROUND = _tables()
+_ARCS = _arcs()
+_AROUND, _SPANS = _cells(_ARCS)
 
 
 @kernel
-def _cut(gaps, ends, count, begin, length, q):  # type: ignore[no-untyped-def]
-    """Take the open arc [begin, begin + length) out of the gaps (start, stop); ends holds the
+def _ahead(angle, start):  # type: ignore[no-untyped-def]
+    """From one angle on to another, both in [0, 2 pi): how far it is, in [0, 2 pi)."""
+    return angle - start if angle >= start else angle - start + _FULL
+
+
+@kernel
+def _cut(gaps, ends, count, begin, end, length, q):  # type: ignore[no-untyped-def]
+    """Take the open arc from `begin` to `end` out of the gaps (start, length); ends holds the
     points that bound each gap. Returns how many gaps are left."""
     if count < 0:  # the first point: the rest of the circle is the only gap
-        gaps[0, 0], gaps[0, 1] = begin + length, begin + _FULL
+        gaps[0, 0], gaps[0, 1] = end, _FULL - length
         ends[0, 0], ends[0, 1] = q, q
         return 1
-    for turn in range(-1, 2):
-        low = begin + turn * _FULL
-        high = low + length
-        g = 0
-        while g < count:
-            start, stop = gaps[g, 0], gaps[g, 1]
-            if low >= stop or high <= start:
-                g += 1
-            elif low <= start and high >= stop:
+    g = 0
+    while g < count:
+        start, own = gaps[g, 0], gaps[g, 1]
+        first = _ahead(begin, start)  # where the arc begins, from the start of the gap
+        last = first + length
+        over = last - _FULL  # how far the arc reaches round into the gap
+        if first >= own:  # it begins behind the gap
+            if over >= own:
                 count -= 1
-                gaps[g], ends[g] = gaps[count], ends[count]
-            elif low <= start:
-                gaps[g, 0], ends[g, 0] = high, q
-                g += 1
-            elif high >= stop:
-                gaps[g, 1], ends[g, 1] = low, q
-                g += 1
+                gaps[g, 0], gaps[g, 1] = gaps[count, 0], gaps[count, 1]
+                ends[g, 0], ends[g, 1] = ends[count, 0], ends[count, 1]
+                continue
+            if over > 0.0:
+                gaps[g, 0], gaps[g, 1], ends[g, 0] = end, own - over, q
+        elif last >= own:  # it begins in the gap and ends behind it
+            if over > 0.0:
+                gaps[g, 0], gaps[g, 1], ends[g, 0] = end, first - over, q
             else:
-                gaps[count, 0], gaps[count, 1] = high, stop
-                ends[count, 0], ends[count, 1] = q, ends[g, 1]
-                gaps[g, 1], ends[g, 1] = low, q
-                count += 1
-                g += 1
+                gaps[g, 1] = first
+            ends[g, 1] = q
+        else:
+            gaps[count, 0], gaps[count, 1] = end, own - last
+            ends[count, 0], ends[count, 1] = q, ends[g, 1]
+            gaps[g, 1], ends[g, 1] = first, q
+            count += 1
+        g += 1
     return count
 
 
@@ -120,7 +147,7 @@ def mark_changes(old, new, near):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _roll(window, wanted, begin, length, around, edges):  # type: ignore[no-untyped-def]
+def _roll(window, wanted, arcs, around, spans, edges):  # type: ignore[no-untyped-def]
     """Edges (u, v, u', v') that start in the wanted cells (CELLS, CELLS) of the window's middle
     tile, grid units from the tile's corner. Returns how many, or -1 where `edges` is too short."""
     gaps = np.empty((64, 2))
@@ -137,41 +164,65 @@ def _roll(window, wanted, begin, length, around, edges):  # type: ignore[no-unty
                 bit = np.int64(trailing_zeros(word))
                 word &= word - np.uint64(1)
                 pu, pv = bit & 7, bit >> 3
-                count = -1
-                for a in range(around.shape[0]):
-                    dv, du = around[a, 0], around[a, 1]
-                    near = window[row + HALO + dv, column + HALO + du]
-                    while near != np.uint64(0):
-                        b = np.int64(trailing_zeros(near))
-                        near &= near - np.uint64(1)
-                        x = 8 * du + (b & 7) - pu
-                        y = 8 * dv + (b >> 3) - pv
-                        if abs(x) > SPAN or abs(y) > SPAN:
-                            continue
-                        arc = length[y + SPAN, x + SPAN]
-                        if arc > 0.0:
-                            q = (y + SPAN) * 1024 + (x + SPAN)
-                            count = _cut(gaps, ends, count, begin[y + SPAN, x + SPAN], arc, q)
-                            if count == 0:
-                                break
-                    if count == 0:
-                        break
-                if num + max(count, 0) > edges.shape[0]:
+                count = _exposed(
+                    window, row + HALO, column + HALO, pu, pv, arcs, around, spans, gaps, ends
+                )
+                if num + count > edges.shape[0]:
                     return -1
-                for g in range(max(count, 0)):
+                for g in range(count):
                     q = ends[g, 1]
                     u, v = 8 * column + pu, 8 * row + pv
                     edges[num, 0], edges[num, 1] = u, v
-                    edges[num, 2] = u + (q & 1023) - SPAN
-                    edges[num, 3] = v + (q >> 10) - SPAN
+                    edges[num, 2] = u + (q & 1023) - WIDE
+                    edges[num, 3] = v + (q >> 10) - WIDE
                     num += 1
     return num
 
 
+@kernel
+def _apart(gaps, count, begin, length):  # type: ignore[no-untyped-def]
+    """Whether an arc meets none of the gaps."""
+    for g in range(count):
+        first = _ahead(begin, gaps[g, 0])
+        if first < gaps[g, 1] or first + length > _FULL:
+            return False
+    return True
+
+
+@kernel
+def _exposed(window, row, column, pu, pv, arcs, around, spans, gaps, ends):  # type: ignore[no-untyped-def]
+    """Find the gaps between the arcs of all points that the disc round (pu, pv) of a cell meets.
+    How many there are."""
+    count = -1
+    for a in range(around.shape[0]):
+        dv, du = around[a, 0], around[a, 1]
+        near = window[row + dv, column + du]
+        if near == np.uint64(0) or (count > 0 and _apart(gaps, count, spans[a, 0], spans[a, 1])):
+            continue
+        while near != np.uint64(0):
+            b = np.int64(trailing_zeros(near))
+            near &= near - np.uint64(1)
+            x = 8 * du + (b & 7) - pu + WIDE
+            y = 8 * dv + (b >> 3) - pv + WIDE
+            length = arcs[y, x, 2]
+            if length > 0.0:
+                q = (y << 10) + x
+                count = _cut(gaps, ends, count, arcs[y, x, 0], arcs[y, x, 1], length, q)
+                if count == 0:
+                    return 0
+    return max(count, 0)
+
+
 @kernel(parallel=True)
-def _roll_all(windows, wanted, begin, length, around, edges, counts):  # type: ignore[no-untyped-def]
+def _roll_all(windows, wanted, arcs, around, spans, edges, counts):  # type: ignore[no-untyped-def]
     for n in prange(windows.shape[0]):
-        counts[n] = _roll(windows[n], wanted[n], begin, length, around, edges[n])
+        counts[n] = _roll(windows[n], wanted[n], arcs, around, spans, edges[n])
+
+
+@kernel
+def _roll_some(windows, wanted, arcs, around, spans, edges, counts):  # type: ignore[no-untyped-def]
+    for n in range(windows.shape[0]):
+        counts[n] = _roll(windows[n], wanted[n], arcs, around, spans, edges[n])
 
 
 def boundary_edges(
@@ -188,11 +239,8 @@ def boundary_edges(
     while True:
         edges = np.empty((len(windows), room, 4), np.int32)
         counts = np.empty(len(windows), np.int64)
-        if len(windows) < FEW:
-            for n in range(len(windows)):
-                counts[n] = _roll(windows[n], wanted[n], _BEGIN, _LENGTH, _AROUND, edges[n])
-        else:
-            _roll_all(windows, wanted, _BEGIN, _LENGTH, _AROUND, edges, counts)
+        roll = _roll_some if len(windows) < FEW else _roll_all
+        roll(windows, wanted, _ARCS, _AROUND, _SPANS, edges, counts)
         if not (counts < 0).any():
             return [own[:count].copy() for own, count in zip(edges, counts, strict=True)]
         room *= 4
