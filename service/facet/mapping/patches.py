@@ -10,6 +10,7 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import prange
 from numpy.typing import NDArray
 
 from facet.mapping.bits import trailing_zeros
@@ -27,6 +28,8 @@ PER_BLOCK = 12  # patches of a block; what finds no place is a leftover
 RUNGS = 40
 RUNG_STEP = 1.2  # a rung of sigma_N is 20 % wide
 FIRST_RUNG = 0.02 * 1024  # ticks: the lowest rung ends here (1 mm at 5 cm voxels)
+SHARES = 8  # parts that the blocks are dealt out to; threads take them
+FEW = 512  # blocks that are not worth waking other threads for
 PURE_SHARE = 4  # one point in so many must be pure for the rung to be read from these alone
 
 
@@ -192,7 +195,9 @@ def _store(blocks, patches, block, count, scratch):  # type: ignore[no-untyped-d
 
 
 @kernel
-def _group_blocks(blocks, observable, normals, patches, which, grouping, changed):  # type: ignore[no-untyped-def]
+def _group_some(  # type: ignore[no-untyped-def]
+    blocks, observable, normals, patches, which, first, step, grouping, changed
+):
     scratch = (
         np.zeros(PER_BLOCK, np.int64),
         np.zeros((PER_BLOCK, 3), np.int64),
@@ -201,9 +206,15 @@ def _group_blocks(blocks, observable, normals, patches, which, grouping, changed
         np.zeros((PER_BLOCK, 6), np.int64),
         np.zeros(512, np.int64),
     )
-    for q in range(which.shape[0]):
+    for q in range(first, which.shape[0], step):
         count = _group(blocks, observable, normals, patches, which[q], grouping, scratch)
         changed[q] = _store(blocks, patches, which[q], count, scratch)
+
+
+@kernel(parallel=True)
+def _group_all(blocks, observable, normals, patches, which, grouping, changed):  # type: ignore[no-untyped-def]
+    for share in prange(SHARES):
+        _group_some(blocks, observable, normals, patches, which, share, SHARES, grouping, changed)
 
 
 @kernel
@@ -244,13 +255,13 @@ def _variance(m):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sum_points(blocks, columns, border, patches, which, rungs, histogram):  # type: ignore[no-untyped-def]
+def _sum_some(blocks, columns, border, patches, which, first, step, rungs, histogram):  # type: ignore[no-untyped-def]
     """Point moments and the rung of sigma_N. Corner voxels hold points of two planes: they are
     left out where enough others are there."""
     pure = np.empty((PER_BLOCK, MOMENTS), np.int64)
     whole = np.empty((PER_BLOCK, MOMENTS), np.int64)
     total = np.empty(PER_BLOCK, np.int64)
-    for q in range(which.shape[0]):
+    for q in range(first, which.shape[0], step):
         block = which[q]
         _add_points(blocks, columns, border, patches, block, True, pure, total)
         count = np.int64(patches.number[block])
@@ -272,6 +283,12 @@ def _sum_points(blocks, columns, border, patches, which, rungs, histogram):  # t
             patches.rung[block, p] = rung
             patches.counted[block, p] = patches.votes[block, p]
             histogram[rung] += patches.votes[block, p]
+
+
+@kernel(parallel=True)
+def _sum_all(blocks, columns, border, patches, which, rungs, histograms):  # type: ignore[no-untyped-def]
+    for share in prange(SHARES):
+        _sum_some(blocks, columns, border, patches, which, share, SHARES, rungs, histograms[share])
 
 
 @kernel
@@ -320,10 +337,11 @@ class PatchField:
         self._fit(store)
         block_of = store.columns.block
         changed = np.empty(len(dirty), np.bool_)
-        _group_blocks(
-            store.blocks, store.columns.observable, normals, self.patches, dirty,
-            self._grouping, changed,
-        )  # fmt: skip
+        sources = store.blocks, store.columns.observable, normals, self.patches
+        if len(dirty) < FEW:
+            _group_some(*sources, dirty, 0, 1, self._grouping, changed)
+        else:
+            _group_all(*sources, dirty, self._grouping, changed)
         regrouped = dirty[changed]
         near = np.union1d(self._around(store, regrouped), dirty)
         relabelled = np.zeros(len(near), np.bool_)
@@ -333,16 +351,18 @@ class PatchField:
         )  # fmt: skip
         relabelled_blocks = near[relabelled]
         touched = np.union1d(block_of[touched_rows], np.union1d(dirty, relabelled_blocks))
-        _sum_points(
-            store.blocks,
-            store.columns,
-            normals.border,
-            self.patches,
-            touched,
-            self.rungs,
-            self.histogram,
-        )
+        self._sum(store, normals, touched)
         return regrouped, relabelled_blocks, touched
+
+    def _sum(self, store: VoxelStore, normals: Normals, which: NDArray[np.int32]) -> None:
+        """Point moments and rungs of the blocks `which`, and what they change of the histogram."""
+        sources = store.blocks, store.columns, normals.border, self.patches
+        if len(which) < FEW:
+            _sum_some(*sources, which, 0, 1, self.rungs, self.histogram)
+        else:
+            histograms = np.zeros((SHARES, RUNGS), np.int64)
+            _sum_all(*sources, which, self.rungs, histograms)
+            self.histogram += histograms.sum(axis=0)
 
     def _around(self, store: VoxelStore, blocks: NDArray[np.int32]) -> NDArray[np.int32]:
         """Blocks whose labels depend on the patches of `blocks`."""
