@@ -27,7 +27,7 @@ from facet.session import read_access_control
 from facet.sinks.log_file import write_recording
 from facet.sources.dialects import Dialects
 from facet.sources.mcap_stream import LogError
-from facet.sources.naming import robot_and_sensor
+from facet.sources.naming import CORRECTION, robot_and_sensor
 from facet.sources.recording import Recording
 from facet_protocol import attachment, topics
 from facet_protocol.codec import SCHEMAS, decode, encode
@@ -227,7 +227,7 @@ def names(folder: Path) -> Target:
         key = data.decode("utf-8", "replace")
         robot, sensor = robot_and_sensor(key)
         assert topics.check_id(robot)
-        assert topics.check_id(sensor)
+        assert sensor == CORRECTION or topics.check_id(sensor)
         dialects.recognise(key, "application/cdr;sensor_msgs/msg/PointCloud2")
         dialects.recognise_channel(key, "sensor_msgs/msg/PointCloud2", "cdr")
         dialects.learn(key)

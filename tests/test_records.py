@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from examples import EXAMPLES
 from facet_protocol import Correction, ProtocolError, ResolvedPose, Status
 from facet_protocol.proto import service_pb2 as pb
 from facet_protocol.records import (
+    decode_corrected,
     decode_correction,
     decode_cut,
     decode_loss,
@@ -52,6 +56,13 @@ def test_a_resolved_pose_keeps_its_bits() -> None:
     received = decode_resolved(encode_resolved(RESOLVED))
     assert received.pose.position.tobytes() == RESOLVED.pose.position.tobytes()
     assert received.pose.orientation_xyzw.tobytes() == RESOLVED.pose.orientation_xyzw.tobytes()
+
+
+@given(st.binary(max_size=200))
+def test_any_bytes_are_a_record_or_a_protocol_error(payload: bytes) -> None:
+    for read in (decode_correction, decode_corrected):
+        with suppress(ProtocolError):
+            read(payload)
 
 
 def test_a_correction_is_good_as_a_whole_or_not_at_all() -> None:
