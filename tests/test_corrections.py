@@ -96,7 +96,7 @@ def digest_of(scans: Iterable[Scan]) -> Any:
     return map_of(scans).digest()
 
 
-@settings(max_examples=6, deadline=None, suppress_health_check=list(HealthCheck))
+@settings(max_examples=5, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_corrected_is_as_if_the_poses_had_been_right(
     data: st.DataObject, tmp_path_factory: pytest.TempPathFactory

@@ -85,7 +85,8 @@ PROMISES: dict[str, str] = {
     "S3": "session::no_password_or_a_wrong_one_is_no_session "
     "session::no_certificate_a_foreign_or_an_old_one_is_no_session",
     "S4": "security::s4_a_flood_of_connections_and_junk_starves_nobody",
-    "S5": "session::a_robot_speaks_under_its_own_name_only",
+    "S5": "session::a_robot_speaks_under_its_own_name_only "
+    "corrections::what_is_wrong_with_one_refuses_the_batch",
     "S6": "session::a_weak_table_is_refused",
     "S7": "security::s7_nothing_is_said_outside_our_prefix security::s7_only_the_publisher_speaks",
     "S8": "mcap_stream::bombs_are_not_inflated fuzz::*",

@@ -25,6 +25,7 @@ from facet.resume import (
     Stopped,
     hold,
     note_newest,
+    origin,
     resume,
     save,
     set_aside,
@@ -384,3 +385,16 @@ def test_no_checkpoint_is_ahead_of_its_log(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="not being written"):
         keeper.save(hold(line.mapper, line.admission, config(tmp_path), line.position, line.newest))
     assert not list(tmp_path.glob("*checkpoint*"))
+
+
+def test_rules_for_robots_are_part_of_where_a_map_comes_from(tmp_path: Path) -> None:
+    """Another rule may give a scan another pose: a checkpoint made without it is not used."""
+    line = Line(tmp_path)
+    line.scans(*room(2))
+    line.checkpoint()
+    line.recorder.commit()
+    rules = {"robots.rules": [{"key": "amcl_pose", "frame": "base_link"}]}
+    other = load_config(None, {"record.directory": tmp_path, "mapping.voxel_m": 0.1, **rules})
+    assert origin(SETTINGS, other) != origin(SETTINGS, config(tmp_path))
+    assert resume(config(tmp_path), Mapper(SETTINGS)).checkpoint is not None
+    assert resume(other, Mapper(SETTINGS)).checkpoint is None

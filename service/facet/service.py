@@ -288,7 +288,7 @@ class Service:
             "export": self._export,
             "record": self._record,
             "checkpoint": self._checkpoint,
-            "erase": _not_yet("scans are taken out by a correction, not by a command"),
+            "erase": _not_yet("a correction moves scans, nothing takes them out yet"),
         }
 
     def _pause(self, parameters: Mapping[str, str]) -> Mapping[str, Any]:
