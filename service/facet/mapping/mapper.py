@@ -155,7 +155,14 @@ class Mapper:
         done("patches")
         limit = limits(self.settings, self._patches.sigma() / TICKS)
         grown, changed = self._tiles.update(
-            self._store, self._patches, limit, regrouped, relabelled, summed, moved
+            self._store,
+            self._normals.normals,
+            self._patches,
+            limit,
+            regrouped,
+            relabelled,
+            summed,
+            moved,
         )
         done("tiles")
         self._table = tabulate(self._tiles.tiles)

@@ -7,6 +7,11 @@ import numpy as np
 from facet.mapping.bits import trailing_zeros
 from facet.mapping.blocks import CENTRE, find, pack, unpack
 from facet.mapping.kernel import kernel
+from facet.mapping.merging import plane_of
+from facet.mapping.settings import BLOCK, STEPS, TILE
+from facet.mapping.sums import SUMS, count_points, read_sums, shift_moments
+
+STRAY = 0.47  # voxels: a voxel whose centroid is so far off its tile-plane is not fitted to
 
 
 @kernel
@@ -65,3 +70,48 @@ def inherit(old_rows, old_owner, old_corner, rows, owner, corner, scratch, count
             counts[scratch[rows[m]] - 1, owner[m]] += 1
     for m in range(old_rows.shape[0]):
         scratch[old_rows[m]] = 0
+
+
+@kernel
+def sum_points(  # type: ignore[no-untyped-def]
+    rows, owner, corner, tile_key, blocks, columns, border, second, nodes, points, total
+):
+    """Sum the voxels' point moments about the tile's corner into points (T, 10), without those
+    that hold points of others: at a border, claimed by a plane at an angle, or STRAY from their
+    tile-plane; count all in total (T,).
+
+    Leftovers count as well: the tails of the noise lie in them, and without these a plane across
+    the grid is bent by where the grid cuts it."""
+    ti, tj, tk = unpack(tile_key)
+    count = total.shape[0]
+    normals, offsets = np.empty((count, 3)), np.empty(count)
+    for t in range(count):
+        nx, ny, nz, _, _ = plane_of(nodes.votes[t], nodes.scatter[t], nodes.unit[t])
+        normals[t, 0], normals[t, 1], normals[t, 2] = nx, ny, nz
+        mean = nodes.mean[t]
+        offsets[t] = (
+            nx * (mean[0] - TILE * ti) + ny * (mean[1] - TILE * tj) + nz * (mean[2] - TILE * tk)
+        )
+    sums = np.empty(SUMS, np.int64)
+    for m in range(rows.shape[0]):
+        if corner[m]:
+            continue
+        row, own = rows[m], owner[m]
+        seen = columns.observable[row]
+        i, j, k = unpack(blocks.keys[columns.block[row]])
+        local = np.int64(columns.local[row])
+        x = BLOCK * i - TILE * ti + (local & 7)
+        y = BLOCK * j - TILE * tj + ((local >> 3) & 7)
+        z = BLOCK * k - TILE * tk + (local >> 6)
+        off = (
+            normals[own, 0] * (x + (seen & 15) / STEPS)
+            + normals[own, 1] * (y + ((seen >> 4) & 15) / STEPS)
+            + normals[own, 2] * (z + ((seen >> 8) & 15) / STEPS)
+            - offsets[own]
+        )
+        if border[row] or second[row] >= 0 or abs(off) > STRAY:
+            total[own] += count_points(columns, row)
+            continue
+        read_sums(columns, row, sums)
+        total[own] += sums[0]
+        shift_moments(sums, x, y, z, points[own])

@@ -1,7 +1,7 @@
 """Patches: inside a block, valid voxels with like normals and offsets; leftovers join a neighbour.
 
 Grouping reads observables only (rounded centroids, one vote a voxel, rounded normals). Beside it a
-patch carries the exact moments of its members' points, for fitting, and their spread as a rung.
+patch carries the spread of its members' points as a rung.
 """
 
 from __future__ import annotations
@@ -42,9 +42,6 @@ class Patches(NamedTuple):
     scatter: NDArray[np.int64]  # (.., 6) sum of their products xx, xy, xz, yy, yz, zz
     unit: NDArray[np.int32]  # (.., 3) sum of the members' normals, times UNIT
     box: NDArray[np.int8]  # (.., 6) least and largest local x, y, z of the members
-    points: NDArray[np.int64]  # (.., 10) exact moments of the pure members' points, ticks from the
-    # block corner; pure: not at a border, and claimed by no plane at an angle
-    total: NDArray[np.int64]  # points of all members
     rung: NDArray[np.int8]  # of sigma_N
     counted: NDArray[np.int32]  # votes that stand in the histogram of rungs
     far: NDArray[np.bool_]  # (B,) the block's labels depend on patches two blocks away, not one
@@ -70,8 +67,6 @@ def empty_patches() -> Patches:
         scatter=np.zeros((*shape, 6), np.int64),
         unit=np.zeros((*shape, 3), np.int32),
         box=np.zeros((*shape, 6), np.int8),
-        points=np.zeros((*shape, MOMENTS), np.int64),
-        total=np.zeros(shape, np.int64),
         rung=np.zeros(shape, np.int8),
         counted=np.zeros(shape, np.int32),
         far=np.zeros(0, np.bool_),
@@ -274,8 +269,6 @@ def _sum_some(blocks, columns, border, patches, which, first, step, rungs, histo
             patches.counted[block, p] = 0
             if p >= count:
                 continue
-            patches.points[block, p] = pure[p]
-            patches.total[block, p] = total[p]
             variance = _variance(pure[p] if PURE_SHARE * pure[p, 0] >= total[p] else whole[p])
             rung = 0
             while rung < RUNGS - 1 and variance > rungs[rung]:

@@ -13,14 +13,14 @@ from numpy.typing import NDArray
 
 from facet.mapping.blocks import CENTRE, pack, pack_all, unpack, unpack_all
 from facet.mapping.kernel import kernel
-from facet.mapping.membership import collect, inherit, shell
+from facet.mapping.membership import collect, inherit, shell, sum_points
 from facet.mapping.memory import Heap, Memory
 from facet.mapping.merging import Limits, Nodes, merge_nodes
-from facet.mapping.normals import UNIT
+from facet.mapping.normals import UNIT, Normals
 from facet.mapping.patches import PER_BLOCK, PatchField
-from facet.mapping.settings import BLOCK, STEPS, TILE
+from facet.mapping.settings import BLOCK, STEPS
 from facet.mapping.store import VoxelStore
-from facet.mapping.sums import MOMENTS, shift_moments
+from facet.mapping.sums import MOMENTS
 
 SIDE = 8  # blocks per tile edge
 
@@ -32,8 +32,9 @@ class Tile:
     key: int
     blocks: NDArray[np.int32]  # of the tile, by ascending block key
     nodes: Nodes  # (T, ...) voxels, about the map's origin
-    points: NDArray[np.int64]  # (T, 10) exact moments of the pure members' points, tile corner
-    total: NDArray[np.int64]  # (T,) points of all members
+    points: NDArray[np.int64]  # (T, 10) exact moments of pure voxels' points, tile corner; pure:
+    # near its tile-plane, not at a border, and claimed by no plane at an angle
+    total: NDArray[np.int64]  # (T,) points of all their voxels
     occupation: NDArray[np.int64]  # (T,) voxels, leftovers included
     rows: NDArray[np.int32]  # (M,) voxel rows of its tile-planes
     owner: NDArray[np.int16]  # (M,) their tile-plane, ascending
@@ -115,23 +116,6 @@ def _tile_nodes(block_keys, neighbours, patches, which, tile_key):  # type: igno
 
 
 @kernel
-def _gather_points(block_keys, patches, which, tile_key, plane_of_patch, count):  # type: ignore[no-untyped-def]
-    """(count, 10) exact point moments about the tile corner, ticks, and (count,) all points."""
-    out = np.zeros((count, MOMENTS), np.int64)
-    total = np.zeros(count, np.int64)
-    ti, tj, tk = unpack(tile_key)
-    for q in range(which.shape[0]):
-        block = which[q]
-        i, j, k = unpack(block_keys[block])
-        x, y, z = BLOCK * i - TILE * ti, BLOCK * j - TILE * tj, BLOCK * k - TILE * tk
-        for p in range(patches.number[block]):
-            plane = plane_of_patch[block, p]
-            total[plane] += patches.total[block, p]
-            shift_moments(patches.points[block, p], x, y, z, out[plane])
-    return out, total
-
-
-@kernel
 def _pairs(blocks, patches, plane_of_patch, tile_key, which, out):  # type: ignore[no-untyped-def]
     """Adjacent tile-planes, the smaller tile first, as own << 32 | place of the other tile among
     the 27 << 16 | other; with repetitions. How many, or -1 where `out` is too short."""
@@ -202,6 +186,7 @@ class TileField:
     def update(
         self,
         store: VoxelStore,
+        normals: Normals,
         patches: PatchField,
         limits: Limits,
         regrouped: NDArray[np.int32],
@@ -222,16 +207,14 @@ class TileField:
             regroup = [int(k) for k in np.unique(tile_keys_of(keys[regrouped]))]
         for key in regroup:
             self._grow(store, patches, key, limits)
-        for key in np.unique(tile_keys_of(keys[summed])):
-            tile = self.tiles[int(key)]
-            tile.points, tile.total = _gather_points(
-                keys, patches.patches, tile.blocks, tile.key, self.plane_of_patch, tile.num_planes
-            )
         moved = np.unique(np.concatenate([regrouped, relabelled, dirty]))
         stale = spread(np.array(regroup, np.int64), keys[moved])
         changed = [int(k) for k in stale if int(k) in self.tiles]
         for key in changed:
             self._fill(store, patches, self.tiles[key])
+        for key in np.union1d(changed, spread(np.zeros(0, np.int64), keys[summed])).tolist():
+            if key in self.tiles:
+                self._sum(store, normals, patches, self.tiles[key])
         for key in self._beside(regroup):
             self._pair(store, patches, self.tiles[key])
         return regroup, changed
@@ -284,9 +267,6 @@ class TileField:
         plane_of_patch = np.zeros((len(tile.blocks), PER_BLOCK), np.int16)
         plane_of_patch[where] = index
         self.plane_of_patch[tile.blocks] = plane_of_patch
-        tile.points, tile.total = _gather_points(
-            store.blocks.keys, patches.patches, tile.blocks, key, self.plane_of_patch, len(kept)
-        )
 
     def _fill(self, store: VoxelStore, patches: PatchField, tile: Tile) -> None:
         near = np.empty(1000, np.int32)
@@ -309,6 +289,14 @@ class TileField:
         tile.occupation = np.bincount(tile.owner[~tile.corner], minlength=tile.num_planes).astype(
             np.int64
         )
+
+    def _sum(self, store: VoxelStore, normals: Normals, patches: PatchField, tile: Tile) -> None:
+        tile.points = np.zeros((tile.num_planes, MOMENTS), np.int64)
+        tile.total = np.zeros(tile.num_planes, np.int64)
+        sum_points(
+            tile.rows, tile.owner, tile.corner, tile.key, store.blocks, store.columns,
+            normals.border, patches.patches.second, tile.nodes, tile.points, tile.total,
+        )  # fmt: skip
 
     def _beside(self, keys: list[int]) -> list[int]:
         """The tiles and their 26 neighbours, as far as they exist, ascending."""
