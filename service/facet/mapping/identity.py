@@ -90,11 +90,10 @@ class Identity:
 
 def _add_up(heritage: Heritage) -> list[tuple[int, int, int]]:
     """(-voxels, old id, plane), most shared first."""
-    pairs = np.stack([heritage.old_id, heritage.plane], axis=1)
-    unique, index = np.unique(pairs, axis=0, return_inverse=True)
-    voxels = np.bincount(index, heritage.voxels, minlength=len(unique)).astype(int)
-    return sorted(
-        (-int(n), int(old), int(plane))
-        for n, (old, plane) in zip(voxels, unique, strict=True)
-        if old != NO_PLANE
-    )
+    on = heritage.old_id != NO_PLANE
+    pairs = heritage.old_id[on] << 32 | heritage.plane[on]
+    unique, index = np.unique(pairs, return_inverse=True)
+    voxels = np.bincount(index, heritage.voxels[on], minlength=len(unique)).astype(np.int64)
+    order = np.lexsort((unique, -voxels))
+    shared = -voxels[order], unique[order] >> 32, unique[order] & 0xFFFFFFFF
+    return list(zip(*(column.tolist() for column in shared), strict=True))

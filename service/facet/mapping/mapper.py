@@ -14,7 +14,7 @@ from facet.mapping.census import Census, tile_points
 from facet.mapping.contours import ContourField
 from facet.mapping.describe import Describer, Figures
 from facet.mapping.digest import Digest, derived_digest, model_planes, state_digest
-from facet.mapping.fitting import fit_plane
+from facet.mapping.fitting import Fit, fit_plane
 from facet.mapping.freespace import FreeSpace
 from facet.mapping.identity import Heritage, Identity
 from facet.mapping.invariants import check_invariants
@@ -82,6 +82,7 @@ class Mapper:
         self._describer = Describer(self.settings)
         self._witness = Witness()
         self._census = Census()
+        self._fits: dict[int, tuple[bytes, Fit]] = {}  # by plane id, with what it was made of
         self._table = tabulate({})
         self._planes = group_planes(self._table, limits(self.settings, 0.0), self.settings)
         self._stamp_ns = 0
@@ -253,25 +254,47 @@ class Mapper:
         label, table = self._planes.label, self._table
         named = np.where(label == FREE, 0, ids[label] if len(ids) else 0)
         renamed = self._tiles.name(table.tile_keys, table.starts, named)
-        members: Members = {int(i): [] for i in ids}
         numbers = np.arange(len(label)) - table.starts[table.tile_of]
-        keys = table.tile_keys[table.tile_of]
-        for node in np.flatnonzero(named):
-            members[int(named[node])].append((int(keys[node]), int(numbers[node])))
+        order = np.argsort(label, kind="stable")
+        order = order[np.searchsorted(label[order], 0) :]  # FREE is less
+        keys = table.tile_keys[table.tile_of[order]]
+        pairs = list(zip(keys.tolist(), numbers[order].tolist(), strict=True))
+        ends = np.cumsum(np.bincount(label[order], minlength=len(ids))).tolist()
+        starts = [0, *ends][: len(ends)]
+        members = {int(i): pairs[low:high] for i, low, high in zip(ids, starts, ends, strict=True)}
         return members, renamed
 
     def _figures(
         self, ids: NDArray[np.int64], points: PointFit, members: Members
     ) -> dict[int, Figures]:
-        tick_m = self.settings.tick_m
         figures = {}
+        for gone in self._fits.keys() - set(ids.tolist()):
+            del self._fits[gone]
         for plane, plane_id in enumerate(ids.tolist()):
             total, centroid = int(points.total[plane]), points.centroid[plane]
             unit = self._planes.nodes.unit[plane]
-            fit = fit_plane(
-                float(points.weight[plane]), centroid, points.scatter[plane], unit, tick_m
+            fit = self._fit(
+                plane_id, float(points.weight[plane]), centroid, points.scatter[plane], unit
             )
             seen = self._witness.of({key for key, _ in members[plane_id]})
             voxels = int(self._planes.occupation[plane])
             figures[plane_id] = Figures(fit, total, voxels, centroid, seen)
         return figures
+
+    def _fit(
+        self,
+        plane_id: int,
+        weight: float,
+        centroid: NDArray[np.float64],
+        scatter: NDArray[np.float64],
+        unit: NDArray[np.float64],
+    ) -> Fit:
+        """`fit_plane`, or what it said last time if it was asked the same."""
+        key = b"".join(
+            [np.float64(weight).tobytes(), *(c.tobytes() for c in (centroid, scatter, unit))]
+        )
+        known = self._fits.get(plane_id)
+        if known is None or known[0] != key:
+            known = key, fit_plane(weight, centroid, scatter, unit, self.settings.tick_m)
+        self._fits[plane_id] = known
+        return known[1]

@@ -197,10 +197,16 @@ def _fits(votes, mean, scatter, unit, t, normal, centre, limit):  # type: ignore
 def _adopt_along(votes, mean, scatter, unit, edges, label, normals, centres, limit):  # type: ignore[no-untyped-def]
     """Offer free nodes to the planes of their neighbours, nearest first, until nothing changes."""
     count = votes.shape[0]
+    loose = np.empty(edges.shape[0], np.int64)  # edges with a free end: the others offer nothing
+    num = 0
+    for e in range(edges.shape[0]):
+        loose[num] = e
+        num += label[edges[e, 0]] == -1 or label[edges[e, 1]] == -1
     for _ in range(10):
         best = np.full(count, -1, np.int64)
         best_rms = np.full(count, np.inf)
-        for e in range(edges.shape[0]):
+        for at in range(num):
+            e = loose[at]
             for way in range(2):
                 t, other = edges[e, way], edges[e, 1 - way]
                 p = label[other]

@@ -78,6 +78,42 @@ def _keys(edges):  # type: ignore[no-untyped-def]
     return start, stop
 
 
+@kernel
+def _single(start, stop):  # type: ignore[no-untyped-def]
+    """(E,) whether an edge is there one way only; edges ascend by (start, stop)."""
+    count = start.shape[0]
+    single = np.ones(count, np.bool_)
+    for e in range(count):
+        o = np.searchsorted(start, stop[e])
+        while o < count and start[o] == stop[e]:
+            if stop[o] == start[e]:
+                single[e] = False
+            o += 1
+    return single
+
+
+@kernel
+def _chains(follow):  # type: ignore[no-untyped-def]
+    """Closed chains: their edges (N,) one after the other, and where each ends."""
+    count = follow.shape[0]
+    done = np.zeros(count, np.bool_)
+    edges, ends = np.empty(count, np.int64), np.empty(count, np.int64)
+    num, num_chains = 0, 0
+    for first in range(count):
+        begin, e = num, first
+        while e >= 0 and not done[e]:
+            done[e] = True
+            edges[num] = e
+            num += 1
+            e = follow[e]
+        if num > begin and e == first:
+            ends[num_chains] = num
+            num_chains += 1
+        else:
+            num = begin
+    return edges[:num], ends[:num_chains]
+
+
 def stitch(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """Closed rings (M, 2) of directed edges (E, 4), each from its smallest vertex, in order of it.
 
@@ -85,31 +121,24 @@ def stitch(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     if not len(edges):
         return []
     start, stop = _keys(edges)
-    there = np.unique(np.stack([start, stop], axis=1), axis=0, return_index=True)[1]
-    edges, start, stop = edges[there], start[there], stop[there]
-    both = np.concatenate([np.stack([start, stop], axis=1), np.stack([stop, start], axis=1)])
-    _, index, counts = np.unique(both, axis=0, return_inverse=True, return_counts=True)
-    single = counts[index[: len(edges)]] == 1
-    edges, start, stop = edges[single], start[single], stop[single]
-    follow = _successors(start, stop, edges)
-    rings, done = [], np.zeros(len(edges), np.bool_)
-    for first in range(len(edges)):
-        if done[first]:
-            continue
-        chain = []
-        e = first
-        while e >= 0 and not done[e]:
-            done[e] = True
-            chain.append(e)
-            e = int(follow[e])
-        if e == first:
-            rings.extend(_simple_rings(edges[chain, :2], start[chain]))
+    order = np.lexsort((stop, start))
+    start, stop = start[order], stop[order]
+    new = np.concatenate([[True], (start[1:] != start[:-1]) | (stop[1:] != stop[:-1])])
+    order, start, stop = order[new], start[new], stop[new]
+    single = _single(start, stop)
+    edges, start, stop = edges[order[single]], start[single], stop[single]
+    chained, ends = _chains(_successors(start, stop, edges))
+    rings = []
+    for chain in np.split(chained, ends[:-1]) if len(ends) else []:
+        rings.extend(_simple_rings(edges[chain, :2], start[chain]))
     return sorted(rings, key=lambda ring: tuple(ring[0]))
 
 
 def _simple_rings(ring: NDArray[np.int64], keys: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """A ring split where it comes back to a vertex, so that none touches itself. Signed areas add
     up to that of the whole. keys: (M,) of the vertices, ascending by (u, v)."""
+    if len(np.unique(keys)) == len(keys):
+        return [np.roll(ring, -int(np.argmin(keys)), axis=0)] if len(ring) > 2 else []
     rings, path = [], list[int]()
     place: dict[int, int] = {}
     for index, key in enumerate(keys.tolist()):

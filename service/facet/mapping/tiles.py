@@ -44,6 +44,7 @@ class Tile:
     ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     heritage: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 3), np.int64))
     # ids: (T,) at the last update; heritage: (plane id then, tile-plane now, voxels they share)
+    named: bool = False  # the heritage is that of its ids
 
     @property
     def num_planes(self) -> int:
@@ -228,9 +229,12 @@ class TileField:
         for index, key in enumerate(tile_keys.tolist()):
             tile = self.tiles[key]
             own = ids[starts[index] : starts[index + 1]]
-            if not np.array_equal(own, tile.ids):
+            same = np.array_equal(own, tile.ids)
+            if same and tile.named:
+                continue
+            if not same:
                 renamed.append(key)
-            tile.ids = own
+            tile.ids, tile.named = own.copy(), True
             tile.heritage = np.stack([own, np.arange(len(own)), tile.occupation], axis=1)
         return renamed
 
@@ -286,6 +290,7 @@ class TileField:
         old, own = np.nonzero(counts)
         tile.heritage = np.stack([tile.ids[old], own, counts[old, own]], axis=1)
         tile.rows, tile.owner, tile.corner = new
+        tile.named = False
         tile.occupation = np.bincount(tile.owner[~tile.corner], minlength=tile.num_planes).astype(
             np.int64
         )
