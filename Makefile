@@ -65,6 +65,6 @@ docker-check: ## the images' recipe and the compose file, without an engine
 	build/docker/bin/hadolint docker/Dockerfile
 	build/docker/bin/docker-compose -f docker/compose.yaml config --quiet
 
-clean: ## also the compiled loops: do it after changing a kernel that another file calls
+clean: ## also the compiled loops
 	rm -rf .pytest_cache .mypy_cache .ruff_cache .hypothesis build dist out
 	find service protocol tests -name __pycache__ -type d -exec rm -rf {} +

@@ -59,7 +59,7 @@ PLACES = (
             Known("leg 2 far", Y, 8.85, 0.03), Known("leg 2 near", Y, 6.78, 0.03),
             Known("leg 3", X, -10.46, 0.03),
         ),
-        MapSettings(voxel_m=0.2),
+        MapSettings(voxel_m=0.15, theta_deg=12.0),
     ),
     Place(
         "rooms",
@@ -67,7 +67,7 @@ PLACES = (
             Known("floor", Z, -1.27, 0.03), Known("ceiling", Z, 1.64, 0.03),
             Known("wall south", Y, -1.46, 0.03), Known("wall north", Y, 3.07, 0.03),
         ),
-        MapSettings(voxel_m=0.1, max_range_m=5.0),
+        MapSettings(voxel_m=0.1, theta_deg=12.0),
         apart=(("floor", "ceiling", 2.91, 0.03),),
     ),
     Place(
