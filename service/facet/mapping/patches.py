@@ -28,7 +28,7 @@ PER_BLOCK = 12  # patches of a block; what finds no place is a leftover
 RUNGS = 40
 RUNG_STEP = 1.2  # a rung of sigma_N is 20 % wide
 FIRST_RUNG = 0.02 * 1024  # ticks: the lowest rung ends here (1 mm at 5 cm voxels)
-SHARES = 8  # parts that the blocks are dealt out to; threads take them
+SHARES = 16  # parts that the blocks are dealt out to; threads take them
 FEW = 512  # blocks that are not worth waking other threads for
 PURE_SHARE = 4  # one point in so many must be pure for the rung to be read from these alone
 
@@ -191,7 +191,7 @@ def _store(blocks, patches, block, count, scratch):  # type: ignore[no-untyped-d
 
 @kernel
 def _group_some(  # type: ignore[no-untyped-def]
-    blocks, observable, normals, patches, which, first, step, grouping, changed
+    blocks, observable, normals, patches, which, start, stop, grouping, changed
 ):
     scratch = (
         np.zeros(PER_BLOCK, np.int64),
@@ -201,15 +201,17 @@ def _group_some(  # type: ignore[no-untyped-def]
         np.zeros((PER_BLOCK, 6), np.int64),
         np.zeros(512, np.int64),
     )
-    for q in range(first, which.shape[0], step):
+    for q in range(start, stop):
         count = _group(blocks, observable, normals, patches, which[q], grouping, scratch)
         changed[q] = _store(blocks, patches, which[q], count, scratch)
 
 
 @kernel(parallel=True)
 def _group_all(blocks, observable, normals, patches, which, grouping, changed):  # type: ignore[no-untyped-def]
+    size = (which.shape[0] + SHARES - 1) // SHARES  # blocks beside one another share cache lines
     for share in prange(SHARES):
-        _group_some(blocks, observable, normals, patches, which, share, SHARES, grouping, changed)
+        start, stop = share * size, min(which.shape[0], (share + 1) * size)
+        _group_some(blocks, observable, normals, patches, which, start, stop, grouping, changed)
 
 
 @kernel
@@ -250,13 +252,13 @@ def _variance(m):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _sum_some(blocks, columns, border, patches, which, first, step, rungs, histogram):  # type: ignore[no-untyped-def]
+def _sum_some(blocks, columns, border, patches, which, start, stop, rungs, histogram):  # type: ignore[no-untyped-def]
     """Point moments and the rung of sigma_N. Corner voxels hold points of two planes: they are
     left out where enough others are there."""
     pure = np.empty((PER_BLOCK, MOMENTS), np.int64)
     whole = np.empty((PER_BLOCK, MOMENTS), np.int64)
     total = np.empty(PER_BLOCK, np.int64)
-    for q in range(first, which.shape[0], step):
+    for q in range(start, stop):
         block = which[q]
         _add_points(blocks, columns, border, patches, block, True, pure, total)
         count = np.int64(patches.number[block])
@@ -280,8 +282,10 @@ def _sum_some(blocks, columns, border, patches, which, first, step, rungs, histo
 
 @kernel(parallel=True)
 def _sum_all(blocks, columns, border, patches, which, rungs, histograms):  # type: ignore[no-untyped-def]
+    size = (which.shape[0] + SHARES - 1) // SHARES
     for share in prange(SHARES):
-        _sum_some(blocks, columns, border, patches, which, share, SHARES, rungs, histograms[share])
+        start, stop = share * size, min(which.shape[0], (share + 1) * size)
+        _sum_some(blocks, columns, border, patches, which, start, stop, rungs, histograms[share])
 
 
 @kernel
@@ -332,7 +336,7 @@ class PatchField:
         changed = np.empty(len(dirty), np.bool_)
         sources = store.blocks, store.columns.observable, normals, self.patches
         if len(dirty) < FEW:
-            _group_some(*sources, dirty, 0, 1, self._grouping, changed)
+            _group_some(*sources, dirty, 0, len(dirty), self._grouping, changed)
         else:
             _group_all(*sources, dirty, self._grouping, changed)
         regrouped = dirty[changed]
@@ -351,7 +355,7 @@ class PatchField:
         """Point moments and rungs of the blocks `which`, and what they change of the histogram."""
         sources = store.blocks, store.columns, normals.border, self.patches
         if len(which) < FEW:
-            _sum_some(*sources, which, 0, 1, self.rungs, self.histogram)
+            _sum_some(*sources, which, 0, len(which), self.rungs, self.histogram)
         else:
             histograms = np.zeros((SHARES, RUNGS), np.int64)
             _sum_all(*sources, which, self.rungs, histograms)
