@@ -22,7 +22,7 @@ def edges_of(contour: Contour) -> set[tuple[int, ...]]:
 
 def points_of(contour: Contour) -> NDArray[np.int64]:
     """All grid points of a plane's outline."""
-    shares = [share.points for share in contour.shares.values()]
+    shares = [share.points + np.array(share.corner) for share in contour.shares.values()]
     return np.unique(np.concatenate(shares).astype(np.int64), axis=0)
 
 

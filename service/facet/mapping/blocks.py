@@ -86,21 +86,41 @@ def rehash(keys: Int64Array, count: int, size: int) -> tuple[Int64Array, NDArray
 
 
 class Blocks(NamedTuple):
-    """Blocks of 8^3 voxels as columns; what the kernels read. All (B, ...) with capacity B."""
+    """Blocks of 8^3 voxels as columns; what the kernels read. (B, ...) with capacity B: by block.
+
+    Most of the lines of a block are empty, as a wall or a floor takes a seventh of its voxels."""
 
     table_keys: Int64Array  # (H,)
     table_values: NDArray[np.int32]  # (H,)
     keys: Int64Array  # (B,) packed block index
-    rows: NDArray[np.int32]  # (B, 512) voxel row at local index x + 8 y + 64 z, -1: none
+    lines: NDArray[np.int32]  # (B, 64) line of 8 voxels along x at y + 8 z, 0: none has a row
+    rows: NDArray[np.int32]  # (L, 8) by line, capacity L: the row of each voxel plus 1, 0: none
     occupied: NDArray[np.uint64]  # (B, 8) a bit x + 8 y for each z: observable says occupied
     neighbours: NDArray[np.int32]  # (B, 27) at (dx+1) + 3 (dy+1) + 9 (dz+1), -1: none
+
+
+@kernel
+def row_at(blocks: Blocks, block: int, local: int) -> Any:
+    """The row of a voxel at local index x + 8 y + 64 z of a block, or -1."""
+    return blocks.rows[blocks.lines[block, local >> 3], local & 7] - 1
+
+
+@kernel
+def put_row(blocks: Blocks, num_lines: int, block: int, local: int, row: int) -> int:
+    """Enter a voxel's row, line `num_lines` being the first that is free. Returns the next one."""
+    line = blocks.lines[block, local >> 3]
+    if line == 0:
+        line = num_lines
+        blocks.lines[block, local >> 3] = line
+        num_lines += 1
+    blocks.rows[line, local & 7] = row + 1
+    return num_lines
 
 
 @kernel
 def add_block(blocks: Blocks, count: int, key: int) -> int:
     """Append the block `key` as number `count` and link it with its neighbours. Returns `count`."""
     blocks.keys[count] = key
-    blocks.rows[count] = -1
     put(blocks.table_keys, blocks.table_values, key, count)
     bi, bj, bk = unpack(key)
     for n in range(27):

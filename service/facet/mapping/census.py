@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from facet.mapping.bits import trailing_zeros
-from facet.mapping.blocks import CENTRE, unpack
+from facet.mapping.blocks import CENTRE, row_at, unpack
 from facet.mapping.kernel import kernel
 from facet.mapping.normals import ALIGNED, MIXED, SPARSE, THICK, VALID, Normals
 from facet.mapping.patches import Patches
@@ -92,7 +92,7 @@ def _fill(blocks, observable, label, id_of_patch, which, tile, centroids, ids): 
             while word != np.uint64(0):
                 bit = np.int64(trailing_zeros(word))
                 word &= word - np.uint64(1)
-                row = blocks.rows[block, 64 * z + bit]
+                row = row_at(blocks, block, 64 * z + bit)
                 seen = observable[row]
                 centroids[count, 0] = 8 * (corner[0] + (bit & 7)) + (seen & 15)
                 centroids[count, 1] = 8 * (corner[1] + (bit >> 3)) + ((seen >> 4) & 15)

@@ -67,11 +67,15 @@ def _gather(blocks, observable, member, block, voxels):  # type: ignore[no-untyp
     """List the voxels of a block. How many. One look-up at a time for all of them: they do not
     wait for one another."""
     count = 0
-    rows = blocks.rows[block]
-    for local in range(512):
-        voxels.local[count] = local
-        voxels.row[count] = rows[local]
-        count += rows[local] >= 0
+    for place in range(64):
+        line = blocks.lines[block, place]
+        if line == 0:
+            continue
+        for x in range(8):
+            row = blocks.rows[line, x] - 1
+            voxels.local[count] = 8 * place + x
+            voxels.row[count] = row
+            count += row >= 0
     for v in range(count):
         voxels.seen[v] = observable[voxels.row[v]]
     for v in range(count):

@@ -54,10 +54,11 @@ def _project(rows, blocks, block_of, local_of, observable, axis_u, axis_v, out):
 
 
 @kernel
-def _paint(points, tile_u, tile_v, cells):  # type: ignore[no-untyped-def]
-    """Set the bits of the points (N, 2) that lie in a (u, v) tile."""
+def _paint(points, corner, tile_u, tile_v, cells):  # type: ignore[no-untyped-def]
+    """Set the bits of the points (N, 2), relative to a corner, that lie in a (u, v) tile."""
+    left, low = corner[0] - SIZE * tile_u, corner[1] - SIZE * tile_v
     for p in range(points.shape[0]):
-        u, v = points[p, 0] - SIZE * tile_u, points[p, 1] - SIZE * tile_v
+        u, v = left + points[p, 0], low + points[p, 1]
         if 0 <= u < SIZE and 0 <= v < SIZE:
             bit = np.uint64(1) << np.uint64((u & 7) + 8 * (v & 7))
             cells[v >> 3, u >> 3] |= bit
@@ -89,7 +90,8 @@ def _places(points):  # type: ignore[no-untyped-def]
 class Share:
     """What one tile-plane gives to its plane's outline."""
 
-    points: NDArray[np.int32]  # (N, 2) grid units
+    corner: tuple[int, int]  # grid units, the least of its points
+    points: NDArray[np.int16]  # (N, 2) grid units from the corner: a tile is 888 across
     places: frozenset[Place]
 
 
@@ -160,7 +162,7 @@ class ContourField:
                 continue
             share = self._share(contour.frame, store, tiles[member[0]], member[1])
             if old is not None:
-                if np.array_equal(old.points, share.points):
+                if old.corner == share.corner and np.array_equal(old.points, share.points):
                     continue
                 stale |= old.places
             stale |= share.places
@@ -187,7 +189,8 @@ class ContourField:
             (int((k + (1 << 31)) >> 32), int(((k + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)))
             for k in keys.tolist()
         )
-        return Share(points, places)
+        u, v = points.min(axis=0).tolist() if len(points) else (0, 0)
+        return Share((u, v), (points - np.array([u, v], np.int32)).astype(np.int16), places)
 
     def _repaint(
         self, contour: Contour, place: Place, near: dict[Place, NDArray[np.bool_]]
@@ -198,7 +201,7 @@ class ContourField:
         drawn = False
         for share in contour.shares.values():
             if place in share.places:
-                _paint(share.points, place[0], place[1], cells)
+                _paint(share.points, share.corner, place[0], place[1], cells)
                 drawn = True
         old = contour.cells.get(place, _NOTHING)
         if drawn:

@@ -102,14 +102,16 @@ def gather(blocks, observable, block, margin, halo):  # type: ignore[no-untyped-
             continue
         y, z = line % edge - margin, line // edge - margin
         start = width * ((y >> 3) + blocks_out) + width * width * ((z >> 3) + blocks_out)
-        inside = 64 * (z & 7) + 8 * (y & 7)
+        inside, cell, voxels = 8 * (z & 7) + (y & 7), np.int64(-99), blocks.rows[0]
         place = ((y + margin) << 8) | ((z + margin) << 16)
         while row != np.uint64(0):
             bit = np.int64(trailing_zeros(row))
             row &= row - np.uint64(1)
             x = bit - margin
-            other = halo.near[start + (x >> 3) + blocks_out]
-            seen = observable[blocks.rows[other, inside + (x & 7)]]
+            if x >> 3 != cell:  # into the next block
+                cell = x >> 3
+                voxels = blocks.rows[blocks.lines[halo.near[start + cell + blocks_out], inside]]
+            seen = observable[voxels[x & 7] - 1]
             words[count] = seen
             poses[count] = seen >> 32
             places[count] = place | bit

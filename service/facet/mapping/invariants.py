@@ -15,7 +15,7 @@ from facet.mapping.kernel import kernel
 from facet.mapping.normals import EMPTY, VALID
 from facet.mapping.planes import FREE
 from facet.mapping.quantise import VIEW
-from facet.mapping.settings import TICKS
+from facet.mapping.settings import BLOCK, TICKS
 from facet.mapping.store import VoxelStore, observe
 from facet.mapping.sums import TOUCHED
 from facet_protocol.messages import Plane
@@ -62,8 +62,13 @@ def check_blocks(store: VoxelStore) -> None:
     expected = np.array([number.get(int(k), -1) for k in near.ravel()]).reshape(told.shape)
     wrong = np.argwhere(told != expected)
     assert not len(wrong), f"block {unpack(int(keys[wrong[0][0]]))} has a wrong neighbour link"
-    block, local = np.nonzero(blocks.rows[:count] >= 0)
-    rows = blocks.rows[block, local]
+    told_rows = blocks.rows[blocks.lines[:count]].reshape(count, BLOCK**3) - 1
+    block, local = np.nonzero(told_rows >= 0)
+    rows = told_rows[block, local]
+    lines = blocks.lines[:count]
+    assert np.array_equal(np.sort(lines[lines > 0]), np.arange(1, store.num_lines)), (
+        "a line is shared"
+    )
     assert np.array_equal(np.sort(rows), np.arange(store.num_rows)), "rows are not 0..V-1"
     assert np.array_equal(store.columns.block[rows], block), "a row names another block"
     assert np.array_equal(store.columns.local[rows], local), "a row names another place"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from facet.mapping.bits import trailing_zeros
-from facet.mapping.blocks import CENTRE, find, pack, unpack
+from facet.mapping.blocks import CENTRE, find, pack, row_at, unpack
 from facet.mapping.kernel import kernel
 from facet.mapping.merging import plane_of
 from facet.mapping.settings import BLOCK, STEPS, TILE
@@ -27,7 +27,7 @@ def collect(blocks, patches, plane_of_patch, tile_key, which, rows, owner, corne
             while word != np.uint64(0):
                 bit = np.int64(trailing_zeros(word))
                 word &= word - np.uint64(1)
-                row = blocks.rows[block, 64 * z + bit]
+                row = row_at(blocks, block, 64 * z + bit)
                 for claim in range(2):
                     label = patches.second[row] if claim else patches.label[row]
                     if label < 0:

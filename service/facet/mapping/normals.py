@@ -21,6 +21,7 @@ from facet.mapping.adaptive import (
     make_rule,
 )
 from facet.mapping.bits import trailing_zeros
+from facet.mapping.blocks import row_at
 from facet.mapping.halo import LISTS, Halo, gather, make_halos
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory, grow_all
@@ -83,7 +84,7 @@ def _estimate_block(blocks, observable, normals, block, stale, rule, halo, scrat
                 bit = np.int64(trailing_zeros(word))
                 word &= word - np.uint64(1)
                 local = 64 * z + bit
-                row = blocks.rows[block, local]
+                row = row_at(blocks, block, local)
                 became = _estimate_row(halo, margin, observable, normals, row, local, rule, scratch)
                 if became != WIDER:
                     stale[z] &= ~(np.uint64(1) << np.uint64(bit))
@@ -99,7 +100,7 @@ def _deepest(blocks, reach, block):  # type: ignore[no-untyped-def]
     """The largest reach of a block's voxels."""
     largest = np.uint8(0)
     for local in range(512):
-        row = blocks.rows[block, local]
+        row = row_at(blocks, block, local)
         if row >= 0:
             largest = max(largest, reach[row])
     return largest

@@ -14,7 +14,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from facet.mapping.bits import trailing_zeros
-from facet.mapping.blocks import CENTRE
+from facet.mapping.blocks import CENTRE, row_at
 from facet.mapping.claims import label_blocks
 from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
@@ -37,13 +37,13 @@ class Patches(NamedTuple):
     """Patches by block and index (B, PER_BLOCK, ...), and labels by voxel row (V,)."""
 
     number: NDArray[np.int8]  # (B,) patches of a block
-    votes: NDArray[np.int32]  # member voxels
+    votes: NDArray[np.int16]  # member voxels
     centroid: NDArray[np.int32]  # (.., 3) sum of rounded centroids, 1/8 voxel from the block corner
-    scatter: NDArray[np.int64]  # (.., 6) sum of their products xx, xy, xz, yy, yz, zz
+    scatter: NDArray[np.int32]  # (.., 6) sum of their products xx, xy, xz, yy, yz, zz
     unit: NDArray[np.int32]  # (.., 3) sum of the members' normals, times UNIT
     box: NDArray[np.int8]  # (.., 6) least and largest local x, y, z of the members
     rung: NDArray[np.int8]  # of sigma_N
-    counted: NDArray[np.int32]  # votes that stand in the histogram of rungs
+    counted: NDArray[np.int16]  # votes that stand in the histogram of rungs
     far: NDArray[np.bool_]  # (B,) the block's labels depend on patches two blocks away, not one
     member: NDArray[np.int8]  # (V,) index of the patch that a valid voxel belongs to, -1: none
     label: NDArray[np.int16]  # (V,) 16 * neighbour + index: the patch that a voxel goes with
@@ -62,13 +62,13 @@ def empty_patches() -> Patches:
     shape = (0, PER_BLOCK)
     return Patches(
         number=np.zeros(0, np.int8),
-        votes=np.zeros(shape, np.int32),
+        votes=np.zeros(shape, np.int16),
         centroid=np.zeros((*shape, 3), np.int32),
-        scatter=np.zeros((*shape, 6), np.int64),
+        scatter=np.zeros((*shape, 6), np.int32),
         unit=np.zeros((*shape, 3), np.int32),
         box=np.zeros((*shape, 6), np.int8),
         rung=np.zeros(shape, np.int8),
-        counted=np.zeros(shape, np.int32),
+        counted=np.zeros(shape, np.int16),
         far=np.zeros(0, np.bool_),
         member=np.zeros(0, np.int8),
         label=np.zeros(0, np.int16),
@@ -113,7 +113,7 @@ def _group(blocks, observable, normals, patches, block, grouping, scratch):  # t
         while word != np.uint64(0):
             bit = np.int64(trailing_zeros(word))
             word &= word - np.uint64(1)
-            row = blocks.rows[block, 64 * z + bit]
+            row = row_at(blocks, block, 64 * z + bit)
             if normals.kind[row] == VALID:
                 order[num] = (np.int32(normals.thickness[row]) << 9) | (64 * z + bit)
                 num += 1
@@ -124,7 +124,7 @@ def _group(blocks, observable, normals, patches, block, grouping, scratch):  # t
     n = np.zeros(3, np.int64)
     for o in range(num):
         local = ordered[o] & 511
-        row = blocks.rows[block, local]
+        row = row_at(blocks, block, local)
         seen = observable[row]
         x, y, z = local & 7, (local >> 3) & 7, local >> 6
         c[0], c[1], c[2] = (
@@ -182,7 +182,7 @@ def _store(blocks, patches, block, count, scratch):  # type: ignore[no-untyped-d
             patches.scatter[block, p, a] = scatter[p, a]
             patches.box[block, p, a] = box[p, a]
     for local in range(512):
-        row = blocks.rows[block, local]
+        row = row_at(blocks, block, local)
         if row >= 0 and patches.member[row] != label[local]:
             patches.member[row] = label[local]
             changed = True
@@ -227,7 +227,7 @@ def _add_points(blocks, columns, border, patches, block, pure, m, total):  # typ
         while word != np.uint64(0):
             bit = np.int64(trailing_zeros(word))
             word &= word - np.uint64(1)
-            row = blocks.rows[block, 64 * z + bit]
+            row = row_at(blocks, block, 64 * z + bit)
             own_label = patches.label[row]
             if own_label >> 4 != CENTRE:
                 continue

@@ -77,10 +77,11 @@ def find_stale(blocks, dirty, reach, block, deepest, common, near, lines, stale)
             if byte == np.uint64(0):
                 continue
             seen = _column(lines, edge, y + margin, z + margin, common)
+            rows = blocks.rows[blocks.lines[block, 8 * z + y]]
             while byte != np.uint64(0):
                 bit = np.int64(trailing_zeros(byte))
                 byte &= byte - np.uint64(1)
-                r = np.int64(reach[blocks.rows[block, 64 * z + 8 * y + bit]])
+                r = np.int64(reach[rows[bit] - 1])
                 found = seen
                 if r != common:
                     found = _column(lines, edge, y + margin, z + margin, r)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from facet.mapping.blocks import Blocks, add_block, find, pack, rehash, unpack_all
+from facet.mapping.blocks import Blocks, add_block, find, pack, put_row, rehash, row_at, unpack_all
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory, copied, grow_all
 from facet.mapping.quantise import VIEW, Ticks
@@ -48,17 +48,19 @@ class Columns(NamedTuple):
 
 @kernel
 def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched_rows):  # type: ignore[no-untyped-def]
-    """Add points from `start` on with `sign`. Returns (next point, blocks, rows, touched) used;
+    """Add points from `start` on with `sign`. Returns (next point, what is used now: blocks, ...);
     next < N means that a capacity ran out and the caller must grow and go on."""
-    num_blocks, num_rows, num_touched = used
+    num_blocks, num_lines, num_rows, num_touched = used
     last_key = -1
     last_block = -1
     max_blocks = blocks.keys.shape[0]
+    max_lines = blocks.rows.shape[0]
     max_rows = columns.block.shape[0]
     max_touched = touched_rows.shape[0]
     for p in range(start, ticks.shape[0]):
-        if num_blocks == max_blocks or num_rows == max_rows or num_touched == max_touched:
-            return p, num_blocks, num_rows, num_touched
+        full = num_blocks == max_blocks or num_lines == max_lines
+        if full or num_rows == max_rows or num_touched == max_touched:
+            return p, (num_blocks, num_lines, num_rows, num_touched)
         tx, ty, tz = ticks[p, 0], ticks[p, 1], ticks[p, 2]
         i, j, k = tx >> 10, ty >> 10, tz >> 10
         key = pack(i >> 3, j >> 3, k >> 3)
@@ -69,11 +71,11 @@ def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched
                 last_block = add_block(blocks, num_blocks, key)
                 num_blocks += 1
         local = (i & 7) + 8 * (j & 7) + 64 * (k & 7)
-        row = blocks.rows[last_block, local]
+        row = row_at(blocks, last_block, local)
         if row < 0:
             row = num_rows
             num_rows += 1
-            blocks.rows[last_block, local] = row
+            num_lines = put_row(blocks, num_lines, last_block, local, row)
             columns.block[row] = last_block
             columns.local[row] = local
         if columns.flags[row] & TOUCHED == 0:
@@ -88,7 +90,7 @@ def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched
             h[0] += sign
             h[1] += sign * pose_hash
             h[2] += sign * pose_hash * pose_hash
-    return ticks.shape[0], num_blocks, num_rows, num_touched
+    return ticks.shape[0], (num_blocks, num_lines, num_rows, num_touched)
 
 
 @kernel
@@ -174,12 +176,14 @@ def _add_blocks(blocks, keys):  # type: ignore[no-untyped-def]
 
 @kernel
 def _place(blocks, columns, rows):  # type: ignore[no-untyped-def]
-    """Enter rows in their blocks."""
+    """Enter rows in their blocks. Returns how many lines are used."""
+    num_lines = 1
     for row in range(rows):
         block, local = columns.block[row], columns.local[row]
-        blocks.rows[block, local] = row
+        num_lines = put_row(blocks, num_lines, block, local, row)
         if columns.observable[row] != 0:
             blocks.occupied[block, local >> 6] |= np.uint64(1) << np.uint64(local & 63)
+    return num_lines
 
 
 class VoxelStore:
@@ -193,7 +197,8 @@ class VoxelStore:
             table_keys=keys,
             table_values=values,
             keys=np.zeros(0, np.int64),
-            rows=np.zeros((0, 512), np.int32),
+            lines=np.zeros((0, 64), np.int32),
+            rows=np.zeros((0, 8), np.int32),
             occupied=np.zeros((0, 8), np.uint64),
             neighbours=np.zeros((0, 27), np.int32),
         )
@@ -209,8 +214,10 @@ class VoxelStore:
             flags=np.zeros(0, np.uint8),
         )
         self.num_blocks = 0
+        self.num_lines = 1  # line 0 is that of no voxels
         self.num_rows = 0
         self._grow_blocks(blocks)
+        self._grow_lines(rows)
         self.columns = grow_all(self._memory, self.columns, 0, rows)
         self._touched_rows = np.empty(4096, np.int32)
         self._num_touched = 0
@@ -248,8 +255,9 @@ class VoxelStore:
         for name, own in self.columns._asdict().items():
             own[deep if name == "high" else slice(rows)] = columns[name]
         self._grow_blocks(max(blocks + 1, 256))
+        self._grow_lines(rows + 4096)
         self.num_blocks, self.num_rows = _add_blocks(self.blocks, block_keys), rows
-        _place(self.blocks, self.columns, rows)
+        self.num_lines = _place(self.blocks, self.columns, rows)
 
     def insert(self, ticks: Ticks) -> None:
         """Add a scan's points."""
@@ -299,16 +307,19 @@ class VoxelStore:
     def _apply(self, ticks: Ticks, sign: int) -> None:
         done = 0
         while done < len(ticks.points):
-            used = (self.num_blocks, self.num_rows, self._num_touched)
-            done, self.num_blocks, self.num_rows, self._num_touched = _insert(
+            used = (self.num_blocks, self.num_lines, self.num_rows, self._num_touched)
+            done, used = _insert(
                 self.blocks, self.columns, ticks.points, ticks.views, ticks.pose_hash, sign,
                 done, used, self._touched_rows,
             )  # fmt: skip
+            self.num_blocks, self.num_lines, self.num_rows, self._num_touched = used
             self._grow()
 
     def _grow(self) -> None:
         if self.num_blocks == len(self.blocks.keys):
             self._grow_blocks(2 * self.num_blocks)
+        if self.num_lines == len(self.blocks.rows):
+            self._grow_lines(2 * self.num_lines)
         if self.num_rows == len(self.columns.block):
             self.columns = grow_all(self._memory, self.columns, self.num_rows, 2 * self.num_rows)
         if self._num_touched == len(self._touched_rows):
@@ -317,11 +328,16 @@ class VoxelStore:
     def _grow_blocks(self, capacity: int) -> None:
         old, used = self.blocks, self.num_blocks
         keys, values = rehash(old.keys, used, 4 << (capacity - 1).bit_length())
-        self.blocks = Blocks(
-            keys,
-            values,
-            *(self._memory.grown(c, used, capacity) for c in old[2:]),
-        )
+        by_block = {
+            name: self._memory.grown(getattr(old, name), used, capacity)
+            for name in ("keys", "lines", "occupied", "neighbours")
+        }
+        self.blocks = old._replace(table_keys=keys, table_values=values, **by_block)
+
+    def _grow_lines(self, capacity: int) -> None:
+        old = self.blocks.rows
+        rows = self._memory.grown(old, min(self.num_lines, len(old)), capacity)
+        self.blocks = self.blocks._replace(rows=rows)
 
 
 __all__ = ["MOMENTS", "Columns", "VoxelStore", "observe", "shift_moments"]
