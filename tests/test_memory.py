@@ -1,0 +1,95 @@
+"""A robot that stands still, or drives the same loop, makes no array of the map grow."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import fields, is_dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from facet.mapping.mapper import Mapper
+from facet_protocol.messages import Scan
+from mapping_logs import log
+
+
+def arrays(thing: Any) -> Iterator[NDArray[Any]]:
+    """Every array that hangs on something of ours."""
+    if isinstance(thing, np.ndarray):
+        yield thing
+    elif isinstance(thing, dict):
+        yield from arrays(list(thing.values()))
+    elif isinstance(thing, (list, tuple)):
+        for part in thing:
+            yield from arrays(part)
+    elif is_dataclass(thing) and not isinstance(thing, type):
+        yield from arrays([getattr(thing, f.name) for f in fields(thing)])
+    elif type(thing).__module__.startswith("facet.mapping"):
+        yield from arrays(getattr(thing, "__dict__", {}))
+
+
+def held_bytes(mapper: Mapper) -> int:
+    """Bytes of all arrays, each once."""
+    return sum({id(a): a.nbytes for a in arrays(mapper)}.values())
+
+
+def column_bytes(mapper: Mapper) -> list[int]:
+    """Bytes of what is kept of every voxel, block and cell."""
+    parts = (mapper._store, mapper._free, mapper._normals, mapper._patches)
+    return [sum(a.nbytes for a in arrays(part)) for part in parts]
+
+
+SHIFTS = 1.02  # a small plane that comes and goes has an outline of some kilobytes
+
+
+def noisy(scan: Scan, seed: int) -> Scan:
+    """The scan of a robot that stands, a millimetre off here and there."""
+    noise = np.random.default_rng(seed).uniform(-1e-3, 1e-3, scan.points.shape)
+    return replace(scan, points=(scan.points + noise).astype(scan.points.dtype))
+
+
+def after(mapper: Mapper, scans: list[Scan]) -> int:
+    for scan in scans:
+        mapper.insert(scan)
+        mapper.update()
+    return held_bytes(mapper)
+
+
+def test_the_same_scan_again_and_again_grows_nothing() -> None:
+    whole = log("room-lidar3d")
+    mapper = Mapper(whole.settings)
+    first, columns = after(mapper, [whole.scans[0]] * 5), column_bytes(mapper)
+    rows, blocks = mapper._store.num_rows, mapper._store.num_blocks
+    assert first > 100 * rows
+    last = after(mapper, [whole.scans[0]] * 80)
+    assert (mapper._store.num_rows, mapper._store.num_blocks) == (rows, blocks)
+    assert column_bytes(mapper) == columns
+    assert last < SHIFTS * first
+
+
+def test_a_standing_robot_grows_nothing() -> None:
+    """Its points find their last new voxels soon."""
+    whole = log("room-lidar3d")
+    mapper = Mapper(whole.settings)
+    scans = [noisy(whole.scans[0], seed) for seed in range(90)]
+    after(mapper, scans[:1])
+    rows = [mapper._store.num_rows]
+    first, columns = after(mapper, scans[1:40]), column_bytes(mapper)
+    rows.append(mapper._store.num_rows)
+    last = after(mapper, scans[40:])
+    rows.append(mapper._store.num_rows)
+    assert rows[2] - rows[1] < (rows[1] - rows[0]) / 10
+    assert column_bytes(mapper) == columns
+    assert last < SHIFTS * first
+
+
+def test_the_same_loop_again_and_again_grows_nothing() -> None:
+    whole = log("room-lidar3d")
+    mapper, loop = Mapper(whole.settings), list(whole.scans)
+    first, rows = after(mapper, loop + loop), mapper._store.num_rows
+    columns = column_bytes(mapper)
+    last = after(mapper, 4 * loop)
+    assert mapper._store.num_rows == rows
+    assert column_bytes(mapper) == columns
+    assert last < SHIFTS * first
