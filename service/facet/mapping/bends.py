@@ -9,6 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from facet.mapping.blocks import unpack
 from facet.mapping.eigen import eigenvector, smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.merging import Nodes
@@ -22,28 +23,36 @@ SUMS = 22  # n; sum x (3), xx (6); sum u (3), u x (9): x in 1/8 voxels, u normal
 
 
 @kernel
-def _add_members(rows, owner, corner, plane_of, voxels, observable, unit, pure, origin, sums):  # type: ignore[no-untyped-def]
+def _add_members(store, normals, patches, rows, owner, corner, plane_of, origin, sums):  # type: ignore[no-untyped-def]
     """Add a tile's pure members to the sums (K, SUMS) of their planes; plane_of (T,), -1: none."""
+    blocks, columns = store
     x = np.empty(3, np.int64)
-    for m in range(rows.shape[0]):
-        k = plane_of[owner[m]]
-        if k < 0 or corner[m] or not pure[m]:
-            continue
-        seen = observable[rows[m]]
-        u = unit[rows[m]]
-        own = sums[k]
-        own[0] += 1
-        s = 4
-        for a in range(3):
-            x[a] = STEPS * voxels[m, a] + ((seen >> (4 * a)) & 15) - origin[k, a]
-        for a in range(3):
-            own[1 + a] += x[a]
-            own[10 + a] += u[a]
-            for b in range(a, 3):
-                own[s] += x[a] * x[b]
-                s += 1
-            for b in range(3):
-                own[13 + 3 * a + b] += u[a] * x[b]
+    low = 0
+    for plane in range(plane_of.shape[0]):
+        high = np.searchsorted(owner, plane, side="right")
+        k = plane_of[plane]
+        for m in range(low, high if k >= 0 else low):
+            row = rows[m]
+            if corner[m] or patches.member[row] < 0 or normals.border[row]:
+                continue
+            if patches.second[row] >= 0:
+                continue
+            seen, local = columns.observable[row], np.int64(columns.local[row])
+            bi, bj, bk = unpack(blocks.keys[columns.block[row]])
+            x[0] = STEPS * (8 * bi + (local & 7)) + (seen & 15) - origin[k, 0]
+            x[1] = STEPS * (8 * bj + ((local >> 3) & 7)) + ((seen >> 4) & 15) - origin[k, 1]
+            x[2] = STEPS * (8 * bk + (local >> 6)) + ((seen >> 8) & 15) - origin[k, 2]
+            sums[k, 0] += 1
+            s = 4
+            for a in range(3):
+                sums[k, 1 + a] += x[a]
+                sums[k, 10 + a] += normals.unit[row, a]
+                for b in range(a, 3):
+                    sums[k, s] += x[a] * x[b]
+                    s += 1
+                for b in range(3):
+                    sums[k, 13 + 3 * a + b] += normals.unit[row, a] * x[b]
+        low = high
 
 
 def _turn(own: NDArray[np.int64]) -> float:
@@ -119,11 +128,8 @@ class Bends:
             if not (own >= 0).any():
                 continue
             tile = self._tiles.tiles[key]
-            rows = tile.rows
-            pure = (patches.member[rows] >= 0) & ~normals.border[rows]
-            pure &= patches.second[rows] < 0
             _add_members(
-                rows, tile.owner, tile.corner, own, self._store.voxel_keys(rows),
-                self._store.columns.observable, normals.unit, pure, origin, sums,
+                (self._store.blocks, self._store.columns), normals, patches, tile.rows, tile.owner,
+                tile.corner, own, origin, sums,
             )  # fmt: skip
         return sums
