@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,8 @@ from facet_protocol import topics
 from facet_protocol.codec import encode
 from facet_protocol.messages import Envelope, Pose, StampedTransform, Transforms
 from rig import PERIOD_NS, START_NS, room_scan, scan_envelope
+
+NOWHERE = Path("nowhere")  # where the log would lie
 
 
 def pose(x: float) -> Pose:
@@ -39,7 +42,7 @@ def admission() -> Admission:
 def again(one: Admission) -> Admission:
     """The same from its arrays, which a file could hold."""
     other = admission()
-    other.thaw({name: np.array(array) for name, array in one.freeze().items()})
+    other.thaw({name: np.array(array) for name, array in one.freeze().items()}, NOWHERE)
     return other
 
 
@@ -100,7 +103,8 @@ def test_what_lacks_is_refused(name: str) -> None:
     one.admit(tf(stamp(0.5), "map", "lidar", 1.0))
     one.admit(lone_scan(1))
     frozen = one.freeze()
+    admission().thaw(frozen, NOWHERE)
     with pytest.raises((KeyError, ValueError, TypeError)):
-        admission().thaw({k: v for k, v in frozen.items() if k != name})
+        admission().thaw({k: v for k, v in frozen.items() if k != name}, NOWHERE)
     with pytest.raises((KeyError, ValueError, TypeError)):
-        admission().thaw({**frozen, name: frozen[name][:0]})
+        admission().thaw({**frozen, name: frozen[name][:0]}, NOWHERE)
