@@ -144,9 +144,7 @@ def estimate(halo, margin, local, seen, rule, scratch):  # type: ignore[no-untyp
     if kind != ALIGNED and (outlier or beside):
         return THICK, 0, 0, 0, 255, False, reach
     cx, cy, cz = seen & 15, (seen >> 4) & 15, (seen >> 8) & 15
-    first = (
-        r  # radius of the region that gives the first normal: smaller where the full one is thick
-    )
+    first = r  # radius of the region of the first normal: smaller where the full one is thick
     while kind != ALIGNED:
         passes = 1 if kind == VALID else rule.passes
         for _ in range(passes):  # look again: its own side, by the normal, and its own slab

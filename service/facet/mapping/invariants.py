@@ -165,8 +165,8 @@ def _check_planes(mapper: Mapper) -> None:
         assert voxels == plane.num_voxels, f"plane {plane.id} has {voxels} voxels"
         num = int(table.total[ids == plane.id].sum())
         assert num == plane.num_points > 0, f"plane {plane.id} has {num} points"
-        least, most = points.get(plane.id, (0, 0))
-        assert least <= num <= most, f"plane {plane.id}: {num} points in voxels of {most}"
+        held = points.get(plane.id, 0)
+        assert num == held, f"plane {plane.id}: {num} points in voxels of {held}"
     shown = [points.plane_ids for points in mapper.points()]
     known = {0, *(p.id for p in planes)}
     assert known.issuperset(np.concatenate([[0], *shown]).tolist()), "a voxel shows an unknown id"
@@ -174,19 +174,15 @@ def _check_planes(mapper: Mapper) -> None:
     assert sum(map(len, shown)) == voxels, "not every voxel is shown once"
 
 
-def _points_by_plane(mapper: Mapper) -> dict[int, tuple[int, int]]:
-    """Points of each plane's members, and of all its voxels."""
-    store, patches = mapper._store, mapper._patches.patches
-    total: dict[int, tuple[int, int]] = {}
+def _points_by_plane(mapper: Mapper) -> dict[int, int]:
+    """Points of all voxels of each plane."""
+    total: dict[int, int] = {}
     for tile in mapper._tiles.tiles.values():
-        own, owner = tile.rows[~tile.corner], tile.owner[~tile.corner]
-        sums = np.zeros((tile.num_planes, 2), np.int64)
-        points = store.num_points(own)
-        np.add.at(sums[:, 0], owner, np.where(patches.member[own] >= 0, points, 0))
-        np.add.at(sums[:, 1], owner, points)
-        for plane_id, (members, voxels) in zip(tile.ids.tolist(), sums.tolist(), strict=False):
-            least, most = total.get(plane_id, (0, 0))
-            total[plane_id] = least + members, most + voxels
+        own = ~tile.corner
+        sums = np.zeros(tile.num_planes, np.int64)
+        np.add.at(sums, tile.owner[own], mapper._store.num_points(tile.rows[own]))
+        for plane_id, points in zip(tile.ids.tolist(), sums.tolist(), strict=False):
+            total[plane_id] = total.get(plane_id, 0) + points
     return total
 
 

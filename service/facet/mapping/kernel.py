@@ -16,20 +16,6 @@ _NAME = hashlib.sha256(b"".join(p.read_bytes() for p in sorted(_HERE.glob("*.py"
 CACHE = _HERE / "__pycache__" / f"kernels-{_NAME[:16]}"
 
 
-def kernel(function: Callable[..., Any] | None = None, *, parallel: bool = False) -> Any:
-    """Compile a loop: without the interpreter's lock, cached, on all cores if `parallel`."""
-    if function is None:
-        return lambda own: kernel(own, parallel=parallel)
-    config: Any = numba.config
-    before = config.CACHE_DIR
-    if _writable():
-        config.CACHE_DIR = str(CACHE)
-    try:
-        return njit(cache=True, nogil=True, parallel=parallel)(function)
-    finally:
-        config.CACHE_DIR = before
-
-
 def _writable() -> bool:
     """Whether the cache can lie beside the sources; else the compiler finds a place of its own."""
     try:
@@ -37,3 +23,20 @@ def _writable() -> bool:
     except OSError:
         return False
     return True
+
+
+_WRITABLE = _writable()
+
+
+def kernel(function: Callable[..., Any] | None = None, *, parallel: bool = False) -> Any:
+    """Compile a loop: without the interpreter's lock, cached, on all cores if `parallel`."""
+    if function is None:
+        return lambda own: kernel(own, parallel=parallel)
+    config: Any = numba.config
+    before = config.CACHE_DIR
+    if _WRITABLE:
+        config.CACHE_DIR = str(CACHE)
+    try:
+        return njit(cache=True, nogil=True, parallel=parallel)(function)
+    finally:
+        config.CACHE_DIR = before
