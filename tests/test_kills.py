@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 
 from facet.commands.play import RobotPublisher
 from facet.commands.replay import replay_log
@@ -23,7 +24,10 @@ from facet.resume import resume
 from facet.session import client_settings, open_session
 from facet.sources.naming import is_scan
 from facet.sources.recording import Recording
-from facet_protocol.messages import Envelope
+from facet_protocol import topics
+from facet_protocol.codec import Message, decode
+from facet_protocol.maps import decode_update
+from facet_protocol.messages import Cut, Envelope
 from kill_target import SETTINGS, config_of
 from rig import free_endpoint, room_scan, scan_envelope
 
@@ -39,15 +43,21 @@ def small_scans(num: int) -> list[Envelope]:
 
 
 class Robots(threading.Thread):
-    """Ten robots at 40 Hz, until told to stop."""
+    """Ten robots at 40 Hz, until told to stop. `seen`: revisions of the map that they heard of."""
 
     def __init__(self, endpoint: str, scans: list[Envelope]) -> None:
         super().__init__(daemon=True)
         self._endpoint, self._scans = endpoint, scans
         self.stopping = threading.Event()
+        self.seen: set[int] = set()
 
     def run(self) -> None:
+        def hear(sample: zenoh.Sample) -> None:
+            self.seen.add(decode_update(sample.payload.to_bytes()).revision)
+
         with open_session(client_settings(self._endpoint, shared_memory=False)) as session:
+            ear = zenoh.handlers.Callback(hear, indirect=False)
+            session.declare_subscriber(topics.update_key("map"), ear)
             publisher = RobotPublisher(session, "map")
             due = time.monotonic()
             number = 0
@@ -102,14 +112,21 @@ class Victim:
         return names
 
 
+def _own(envelope: Envelope) -> Message | None:
+    return decode(envelope) if envelope.key == topics.CUT_TOPIC else None
+
+
 def told(mapper: Mapper) -> tuple[Any, ...]:
     planes = mapper.snapshot().changed
     return mapper.digest(), mapper.revision, [(p.id, p.revision, p.num_points) for p in planes]
 
 
-def check(folder: Path, acknowledged: set[Name]) -> bool:
+def check(folder: Path, acknowledged: set[Name], seen: set[int]) -> bool:
     """Whether the resume could begin with a checkpoint."""
-    recorded = [(e.key, e.epoch, e.sequence) for e in Recording([folder]) if is_scan(e)]
+    logged = list(Recording([folder]))
+    cuts = {m.revision for e in logged if isinstance(m := _own(e), Cut)}
+    assert seen <= cuts, f"revisions that the log does not know: {sorted(seen - cuts)}"
+    recorded = [(e.key, e.epoch, e.sequence) for e in logged if is_scan(e)]
     lost = acknowledged - set(recorded)
     assert not lost, f"{len(lost)} acknowledged messages cannot be read"
     assert len(set(recorded)) == len(recorded)
@@ -125,7 +142,7 @@ def kill_many(folder: Path, num: int, seed: int) -> tuple[int, int]:
     """(messages acknowledged, resumes that began with a checkpoint)."""
     rng, scans = random.Random(seed), small_scans(40)
     acknowledged: set[Name] = set()
-    total = from_checkpoint = 0
+    total = from_checkpoint = num_seen = 0
     for life in range(num):
         if life % LIVES == 0:
             shutil.rmtree(folder, ignore_errors=True)
@@ -139,7 +156,9 @@ def kill_many(folder: Path, num: int, seed: int) -> tuple[int, int]:
         robots.join(20.0)
         acknowledged.update(names)
         total += len(names)
-        from_checkpoint += check(folder, acknowledged)
+        num_seen += len(robots.seen)
+        from_checkpoint += check(folder, acknowledged, robots.seen)
+    assert num_seen > num  # the clients heard of the map
     return total, from_checkpoint
 
 

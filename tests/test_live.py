@@ -21,7 +21,7 @@ KEY = "facet/v1/map/robot/r1/scan/front"
 
 def take_all(inbox: Inbox, num: int) -> list[Envelope]:
     taken: list[Envelope] = []
-    wait_until(lambda: taken.extend(inbox.take(0.01, 1 << 20)) or len(taken) >= num)
+    wait_until(lambda: taken.extend(inbox.take(1 << 20)) or len(taken) >= num)
     return taken
 
 
@@ -94,7 +94,7 @@ def test_a_message_that_is_too_large_is_cut_in_the_transport() -> None:
 def test_without_an_attachment_there_is_no_sequence() -> None:
     inbox = Inbox(10, 1 << 20, lambda: 42)
     inbox.push(sample(0))
-    (envelope,) = inbox.take(0.0, 1 << 20)
+    (envelope,) = inbox.take(1 << 20)
     assert (envelope.epoch, envelope.sequence, envelope.stamp_ns) == (0, 0, 42)
 
 
@@ -102,7 +102,7 @@ def test_the_oldest_is_shed_and_remembered() -> None:
     inbox = Inbox(3, 1 << 20, lambda: 42, patience_s=0.0)
     for sequence in range(1, 8):
         inbox.push(sample(sequence))
-    assert [e.sequence for e in inbox.take(0.0, 1 << 20)] == [5, 6, 7]
+    assert [e.sequence for e in inbox.take(1 << 20)] == [5, 6, 7]
     (loss,) = inbox.take_shed()
     assert astuple(loss) == ("r1", "front", 9, 1, 4, "shed_overload", 42)
     assert inbox.take_shed() == []
@@ -113,7 +113,7 @@ def test_bytes_are_bounded_too() -> None:
     for sequence in range(1, 21):
         inbox.push(sample(sequence, size=100))
         assert inbox.num_bytes <= 1000
-    assert [e.sequence for e in inbox.take(0.0, 450)] == [11, 12, 13, 14, 15]
+    assert [e.sequence for e in inbox.take(450)] == [11, 12, 13, 14, 15]
     (loss,) = inbox.take_shed()
     assert (loss.first_sequence, loss.count) == (1, 10)
     assert len(inbox) == 5
@@ -133,10 +133,10 @@ def test_half_full_the_network_waits_and_then_no_longer() -> None:
         assert pushed(inbox, sequence) < 0.2
     assert 0.3 < pushed(inbox, 5) < 2.0  # half full: no room came
     assert pushed(inbox, 6) < 0.2
-    assert [e.sequence for e in inbox.take(0.0, 1 << 20)] == [1, 2, 3, 4, 5, 6]
+    assert [e.sequence for e in inbox.take(1 << 20)] == [1, 2, 3, 4, 5, 6]
     for sequence in (7, 8, 9, 10):
         assert pushed(inbox, sequence) < 0.2
-    taker = threading.Timer(0.05, inbox.take, (0.0, 1 << 20))
+    taker = threading.Timer(0.05, inbox.take, (1 << 20,))
     taker.start()
     assert pushed(inbox, 11) < 0.35  # room came in time
     taker.join()
@@ -156,7 +156,7 @@ def test_what_is_too_large_does_not_come_in() -> None:
     inbox = Inbox(10, 1 << 20, max_message_bytes=100, tally=account)
     for sequence, size in ((1, 100), (2, 101), (3, 100)):
         inbox.push(sample(sequence, size=size))
-    assert [e.sequence for e in inbox.take(0.0, 1 << 20)] == [1, 3]
+    assert [e.sequence for e in inbox.take(1 << 20)] == [1, 3]
     assert [(x.first_sequence, x.count, x.reason) for x in inbox.take_shed()] == [
         (2, 1, "too_large")
     ]
@@ -167,7 +167,31 @@ def test_what_is_too_large_does_not_come_in() -> None:
 def test_waiting_ends_when_it_is_woken() -> None:
     inbox = Inbox(10, 100)
     inbox.wake()
-    assert inbox.take(60.0, 100) == []
+    assert inbox.wait(60.0, 100)
+    assert inbox.take(100) == []
+
+
+def test_the_recorder_waits_until_it_is_time_to_take() -> None:
+    """Not for each message: a thread that is woken takes its turn from the mapper."""
+    inbox = Inbox(8, 1 << 20)
+    inbox.push(sample(1))
+    assert inbox.wait(0.0, 100)  # the time is up
+    inbox.call()
+    assert not inbox.wait(60.0, 100)  # there is something else to do
+    ended = threading.Event()
+    waiting = threading.Thread(target=lambda: inbox.wait(60.0, 100) and ended.set())
+    waiting.start()
+    for sequence in (2, 3):
+        inbox.push(sample(sequence))
+    assert not ended.wait(0.05)
+    inbox.push(sample(4, size=80))  # so many bytes are there
+    assert ended.wait(10)
+    inbox.take(1 << 20)
+    for sequence in (5, 6, 7, 8):
+        inbox.push(sample(sequence))
+    assert inbox.wait(60.0, 100)  # the queue is half full
+    inbox.call()
+    assert inbox.wait(60.0, 100)  # it still is
 
 
 def test_encodings() -> None:

@@ -153,6 +153,31 @@ def test_nothing_is_mapped_that_is_not_logged(
     assert [e.sequence for e in filter(is_scan, Recording([tmp_path]))] == [1, 2, 3, 4, 5]
 
 
+def test_no_client_sees_a_revision_that_the_log_does_not_know(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The disk fails while an update is derived: it is published when its cut is durable."""
+    with running(tmp_path, **{"record.retry_s": 0.05}) as (service, robot, _):
+        disk = break_disk(service, monkeypatch)
+        disk.set()
+        update = service._pipeline.update
+
+        def fail_meanwhile() -> Any:
+            disk.clear()
+            return update()
+
+        monkeypatch.setattr(service._pipeline, "update", fail_meanwhile)
+        send(robot, 1, 1)
+        wait_until(lambda: service._pipeline.revision, 60)
+        wait_until(lambda: service.account["recorder_failed"] >= 2)
+        assert service._snapshots.since(0).revision == 0
+        disk.set()
+        wait_until(lambda: service._snapshots.since(0).revision == 1)
+        service.stop()
+    cuts = [decode(e) for e in Recording([tmp_path]) if e.key == topics.CUT_TOPIC]
+    assert [cut.revision for cut in cuts] == [1]  # type: ignore[union-attr]
+
+
 def test_commands_of_a_running_service(tmp_path: Path) -> None:
     with running(tmp_path) as (service, robot, client):
         send(robot, 1, 4)

@@ -10,20 +10,20 @@ from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
 
-from facet.outgoing import Outgoing
+from facet.outgoing import Addressed, Outgoing
 from facet.past import Past, definitions_of
 from facet.sequences import SequenceLedger
-from facet.sinks import Message
+from facet.sinks import Message, Sink
 from facet.sinks.recorder import LogPosition, Recorder
 from facet.sources.live import Inbox, loss_of
 from facet.sources.naming import source_of
 from facet.status import Account
-from facet_protocol.messages import Envelope, Loss, Scan, TilePoints
+from facet_protocol.messages import Envelope, Events, Loss, MapUpdate, Scan, Status, TilePoints
 
 logger = logging.getLogger(__name__)
 
 BATCH_BYTES = 8 << 20  # a commit is due after this much, whatever the clock says
-MAX_DERIVED = 4096  # messages of our own that wait for the log
+MAX_DERIVED = 4096  # messages of our own that wait for the log: then it gets no status
 
 
 class DurableQueue:
@@ -78,6 +78,10 @@ class DurableQueue:
 class Intake:
     """The recorder's thread. As a sink it takes what the pipeline says, for the same log.
 
+    Scans go on to the mapper when they are durable, and updates and events to `follower` when their
+    cut is: no client sees a revision that the log does not know. An update is committed at once
+    (`hurry`), so that this costs what the disk takes, not the rest of `commit_s`.
+
     When the disk fails: health is FAIL, nothing is handed on, and it is tried again every
     `retry_s`, or the service ends (`exit_on_failure`).
     """
@@ -95,6 +99,7 @@ class Intake:
         exit_on_failure: bool = False,
         past: Past | None = None,
     ) -> None:
+        self.follower: Sink | None = None  # set before the start
         self._past = past  # is told where in the log scans lie
         self._written_to: LogPosition | None = None
         self._inbox, self._recorder, self._durable = inbox, recorder, durable
@@ -102,7 +107,8 @@ class Intake:
         self._commit_s, self._retry_s = commit_s, retry_s
         self._exit_on_failure = exit_on_failure
         self._ledger = SequenceLedger()
-        self._derived: deque[Envelope | threading.Event] = deque()
+        self._derived: deque[Addressed | threading.Event] = deque()
+        self._said: list[Addressed] = []  # written, not yet durable: for the follower
         self._is_finished = False  # the log is whole, and nothing more comes
         self._awaited: list[threading.Event] = []  # set when what was taken is durable
         self._scans: list[Envelope] = []  # written, not yet durable
@@ -121,13 +127,21 @@ class Intake:
             self._ledger.note(source, epoch, sequence)
 
     def write(self, envelope: Envelope, message: Message | None) -> None:
-        """Queue one of our own messages for the log; scans are in it already."""
+        """Queue one of our own messages for the log; scans are in it already. Points are for the
+        eye: they are not logged, and wait for nothing."""
+        if isinstance(message, TilePoints) and self.follower is not None:
+            self.follower.write(envelope, message)
         if isinstance(message, Scan | TilePoints):
             return
-        if len(self._derived) >= MAX_DERIVED:
-            self._derived.popleft()
-            self._account.count("log_dropped")
-        self._derived.append(envelope)
+        if isinstance(message, Status) and len(self._derived) >= MAX_DERIVED:
+            self._account.count("log_dropped")  # of all else there is no more than was durable
+            return
+        self._derived.append((envelope, message))
+
+    def hurry(self) -> None:
+        """Commit what `write` has taken without waiting for the clock. Scans wait for it all the
+        same: an update that brought the next ones at once would leave the mapper no rest."""
+        self._inbox.call()
 
     def is_logged(self, timeout_s: float) -> bool:
         """Whether all that `write` has taken by now is durable, or is after so long."""
@@ -167,32 +181,38 @@ class Intake:
     def _record_until_stopped(self) -> None:
         due = time.monotonic() + self._commit_s
         while not self._stopping.is_set():
-            if not self._account.failure and self._durable.wait_for_room(self._commit_s):
-                self._take(max(0.0, due - time.monotonic()))
-            if time.monotonic() >= due or self._num_bytes() >= BATCH_BYTES:
-                self._commit()
+            is_due = self._inbox.wait(max(0.0, due - time.monotonic()), BATCH_BYTES)
+            if is_due and not self._account.failure and self._durable.wait_for_room(self._commit_s):
+                self._take()
+            if not self._account.failure:
+                self._take_own()
+            self._commit()
+            if is_due:
                 due = time.monotonic() + self._commit_s
-        self._take(0.0)
+        self._take()
+        self._take_own()
         self._finish()
 
-    def _num_bytes(self) -> int:
-        return sum(len(envelope.payload) for envelope in self._scans)
-
-    def _take(self, timeout_s: float) -> None:
-        """From the inbox and from ourselves into the recorder, counted."""
-        taken = self._inbox.take(timeout_s, BATCH_BYTES)
+    def _take(self) -> None:
+        """From the inbox into the recorder, counted."""
+        taken = self._inbox.take(BATCH_BYTES)
         for loss in self._inbox.take_shed():
             self._lose(loss)
         for envelope in taken:
             self._note(envelope)
             self._recorder.write(envelope)
             self._scans.append(envelope)
+
+    def _take_own(self) -> None:
+        """From ourselves into the recorder."""
         while self._derived:
-            taken_next = self._derived.popleft()
-            if isinstance(taken_next, threading.Event):
-                self._awaited.append(taken_next)
-            else:
-                self._recorder.write(taken_next)
+            taken = self._derived.popleft()
+            if isinstance(taken, threading.Event):
+                self._awaited.append(taken)
+                continue
+            self._recorder.write(taken[0])
+            if isinstance(taken[1], MapUpdate | Events):
+                self._said.append(taken)
 
     def _note(self, envelope: Envelope) -> None:
         """What the number of one message tells: a gap before it, a restart, a late arrival."""
@@ -260,6 +280,10 @@ class Intake:
     def _hand_on(self) -> None:
         while self._awaited:
             self._awaited.pop().set()
+        said, self._said = self._said, []
+        for envelope, message in said:
+            if self.follower is not None:
+                self.follower.write(envelope, message)
         scans, self._scans = self._scans, []
         for envelope in scans:
             source = source_of(envelope)

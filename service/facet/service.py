@@ -122,13 +122,14 @@ class Service:
         self._answers = Answers(
             self._session, self._config.map.id, self._snapshots, self._commands()
         )
+        self._intake.follower = self._publisher
         every_ns = int(self._config.publish.points_s * 1e9) if self._config.publish.points else 0
         self._admission = self._admit()
         self._pipeline = Pipeline(
             self._mapper,
             self._admission,
             self.account,
-            [self._intake, self._publisher],
+            [self._intake],
             self._outgoing,
             every_ns,
         )
@@ -185,9 +186,9 @@ class Service:
         self._reading.shutdown(wait=False, cancel_futures=True)
         self._reporting.join(1.0)
         self._say_status()
+        self._intake.stop(JOIN_S)
         self._answers.close()
         self._publisher.close()
-        self._intake.stop(JOIN_S)
         if self._mapping.is_alive() or self.fault is not None:
             return None
         self._keep_last()
@@ -234,6 +235,7 @@ class Service:
         if self._pipeline.is_stale and time.monotonic() <= self._stop_at:
             self.account.stages({"insert": (time.monotonic() - started) * 1e3})
             update = self._pipeline.update()
+            self._intake.hurry()
             self.account.gauge("planes_changed", len(update.changed))
             self.account.gauge("update_ms", (time.monotonic() - started) * 1e3)
             self.account.gauge("map_lag_s", (time.time_ns() - self._pipeline.log_time_ns) * 1e-9)

@@ -84,6 +84,8 @@ class Inbox:
         self._shed_before: list[Loss] = []  # of what the last `take` took
         self._hold_until: float | None = None  # monotonic s: the network waits no longer
         self._changed = threading.Condition()
+        self._wanted_bytes = max_bytes  # the one who waits comes for this much
+        self._is_called = False
         self._closed = False
 
     def __len__(self) -> int:
@@ -110,12 +112,21 @@ class Inbox:
                 oldest = self._waiting.popleft()
                 self.num_bytes -= oldest.num_bytes
                 self._drop(oldest, "shed_overload")
-            self._changed.notify_all()
+            if self._has_enough():  # not for each message: the mapper has better use for its turn
+                self._changed.notify_all()
 
-    def take(self, timeout_s: float, max_bytes: int) -> list[Envelope]:
-        """What waits, oldest first, up to `max_bytes`; waits up to `timeout_s` for the first."""
+    def wait(self, timeout_s: float, max_bytes: int) -> bool:
+        """Wait until it is time to take: `timeout_s` are over, so much is there, or the queue is
+        half full. False when someone called before that."""
         with self._changed:
-            self._changed.wait_for(lambda: self._waiting or self._closed, timeout_s)
+            self._wanted_bytes = max_bytes
+            self._changed.wait_for(lambda: self._is_called or self._has_enough(), timeout_s)
+            was_called, self._is_called = self._is_called, False
+            return not was_called or self._has_enough()
+
+    def take(self, max_bytes: int) -> list[Envelope]:
+        """What is there, oldest first, up to `max_bytes`."""
+        with self._changed:
             taken: list[Waiting] = []
             num_bytes = 0
             while self._waiting and (not taken or num_bytes < max_bytes):
@@ -160,8 +171,17 @@ class Inbox:
         else:
             self._shed.append(loss)
 
+    def call(self) -> None:
+        """The one who waits, or will, has something else to do."""
+        with self._changed:
+            self._is_called = True
+            self._changed.notify_all()
+
+    def _has_enough(self) -> bool:
+        return self._closed or self.is_half_full or self.num_bytes >= self._wanted_bytes
+
     def wake(self) -> None:
-        """No one waits any longer for a first message, or for room."""
+        """No one waits any longer for messages, or for room."""
         with self._changed:
             self._closed = True
             self._changed.notify_all()
