@@ -8,6 +8,7 @@ import numpy as np
 
 from facet_protocol.codec import Message, encode
 from facet_protocol.messages import (
+    Conflict,
     Corrected,
     CorrectedPose,
     Correction,
@@ -137,6 +138,9 @@ EXAMPLES: dict[str, Message] = {
     "facet.v1.ResolvedPose": ResolvedPose("r1", "front", 7, 42, STAMP_NS, "map", POSE),
     "facet.v1.Correction": Correction("r1", (CorrectedPose("front", 7, 42, POSE),)),
     "facet.v1.Corrected": Corrected("r1", 7, 42, STAMP_NS, 1),
+    "facet.v1.Conflict": Conflict(
+        "r1", "front", 7, 42, STAMP_NS, bytes(32), bytes([255] * 32), True
+    ),
     "facet.v1.Loss": Loss("r1", "front", 7, 43, 5, "lost_upstream", STAMP_NS),
 }
 

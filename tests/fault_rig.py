@@ -7,6 +7,7 @@ import logging
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,20 +33,30 @@ SOURCE = "r1/lidar"
 class Line:
     """Everything behind the door, in one thread: recorded first, then applied."""
 
-    def __init__(self, folder: Path, max_file_bytes: int = 1 << 30) -> None:
+    def __init__(self, folder: Path, max_file_bytes: int = 1 << 30, **options: Any) -> None:
+        """`options` of the admission."""
         self.account, self.mapper = Account(), Mapper(SETTINGS)
         self._folder = folder
         clock = itertools.count(10**18, 10**6)  # files are named by it
         self._recorder = Recorder(
             folder, "map", {}, max_file_bytes=max_file_bytes, clock=lambda: next(clock)
         )
+        self.admission = Admission(self.account, "map", SETTINGS.reach_m, **options)
         self._pipeline = Pipeline(
             self.mapper,
-            Admission(self.account, "map", SETTINGS.reach_m),
+            self.admission,
             self.account,
-            [],
+            [self],
             Outgoing("map", "map"),
         )
+
+    def write(self, envelope: Envelope, message: object) -> None:
+        """What the pipeline says of itself goes into the log too."""
+        if not isinstance(message, Scan):
+            self._recorder.write(envelope)
+
+    def close(self) -> None:
+        """Nothing: the log stays open."""
 
     def take(self, envelopes: Iterable[Envelope]) -> Line:
         for envelope in envelopes:
@@ -68,8 +79,12 @@ class Line:
     def state(self) -> str:
         return state_digest(self.mapper._store, self.mapper._free)
 
+    def log(self) -> list[Envelope]:
+        return list(Recording([self._folder]))
+
     def recorded(self) -> list[bytes]:
-        return [bytes(e.payload) for e in Recording([self._folder])]
+        """What came in, as the log has it."""
+        return [bytes(e.payload) for e in self.log() if not e.key.startswith("/facet/")]
 
     def num_points(self) -> int:
         """Points that the voxels hold."""
@@ -118,12 +133,13 @@ def left_out(
     caplog: pytest.LogCaptureFixture,
     bad: list[Envelope],
     reason: str,
+    **options: Any,
 ) -> Line:
     """Promise C: counted once each, said once, recorded all the same, no trace in the map, and the
     other source goes on."""
-    clean = Line(folder / "clean").take(around([]))
+    clean = Line(folder / "clean", **options).take(around([]))
     with caplog.at_level(logging.INFO):
-        spoiled = Line(folder / "spoiled").take(around(bad))
+        spoiled = Line(folder / "spoiled", **options).take(around(bad))
     account = spoiled.account
     assert account[f"rejected.{reason}[{SOURCE}]"] == account[f"rejected.{reason}"] == len(bad)
     assert account.balance().rejected == len(bad)

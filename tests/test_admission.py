@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from facet.admission import Admission
+from facet.placement import Admitted
 from facet.sources.naming import robot_and_sensor
 from facet.status import Account
 from facet_protocol.messages import Envelope, Pose
@@ -17,9 +18,9 @@ def admit(*envelopes: Envelope) -> tuple[list[int], dict[str, int]]:
     """(stamps of what was admitted, what was counted)."""
     account = Account()
     admission = Admission(account, "map", 8.0)
-    admitted = [a for envelope in envelopes for a in admission.admit(envelope)]
+    outcomes = [one for envelope in envelopes for one in admission.admit(envelope)]
     counted = {n: v for n, v in account.counters().items() if "[" not in n}
-    return [scan.sequence for _, scan, _ in admitted], counted
+    return [one.scan.sequence for one in outcomes if isinstance(one, Admitted)], counted
 
 
 def test_every_scan_once() -> None:

@@ -3,6 +3,7 @@ leaves no trace in the map; the other robots go on."""
 
 from __future__ import annotations
 
+import hashlib
 import logging
 import time
 import tracemalloc
@@ -15,9 +16,9 @@ import numpy as np
 import pytest
 
 from facet_protocol.codec import decode
-from facet_protocol.messages import Envelope, LineFan, Pose, ProtocolError
+from facet_protocol.messages import Conflict, Envelope, LineFan, Pose, ProtocolError
 from facet_protocol.scans import encode_fan
-from facet_protocol.topics import scan_key
+from facet_protocol.topics import CONFLICT_TOPIC, scan_key
 from fault_rig import (
     SOURCE,
     Line,
@@ -199,21 +200,63 @@ def stamped(stamp_ns: int) -> Envelope:
     return scan_envelope(replace(small_scan(5), stamp_ns=stamp_ns))
 
 
-def test_f15_a_jump_is_flagged(tmp_path: Path, caplog: Log) -> None:
-    scan = replace(small_scan(5), stamp_ns=START_NS + 125_000_000)  # 25 ms after the first
-    there = Pose(np.array([5.1, 0.0, 1.2]), scan.pose.orientation_xyzw)
-    oddly(tmp_path / "moved", caplog, [scan_envelope(replace(scan, pose=there))], "pose_jump")
+def at(x: float, turn_deg: float = 0.0, after_ms: float = 25.0, sequence: int = 5) -> Envelope:
+    """A scan so long after the first of r1, so far from where that was taken."""
+    half = np.radians(turn_deg) / 2.0
+    pose = Pose(np.array([x, 0.0, 1.2]), np.array([0.0, 0.0, np.sin(half), np.cos(half)]))
+    stamp_ns = small_scan(1).stamp_ns + int(after_ms * 1e6)
+    return scan_envelope(replace(small_scan(sequence), pose=pose, stamp_ns=stamp_ns))
+
+
+JUMPS = {
+    "moved": at(5.01),
+    "far": at(-400.0),
+    "turned": at(0.0, 90.5),
+    "back": at(0.0, 180.0),
+    "earlier": at(5.01, after_ms=-25.0),
+}
+NO_JUMPS = {"less": at(4.99), "turned": at(0.0, 89.5), "later": at(400.0, after_ms=101.0)}
+
+
+@pytest.mark.parametrize("name", JUMPS)
+def test_f15_a_jump_is_flagged(name: str, tmp_path: Path, caplog: Log) -> None:
+    """And applied, for it may be that the robot knows better now."""
+    jump = JUMPS[name]
+    line = Line(tmp_path).take([*envelopes("r1", 1), jump, *envelopes("r2", 1)])
+    assert line.account[f"pose_jump[{SOURCE}]"] == line.account["pose_jump"] == 1
+    assert line.account["applied"] == 3
+    assert len(lines(caplog, "pose_jump")) == 1
+
+
+@pytest.mark.parametrize("name", JUMPS)
+def test_f15_a_jump_is_refused_where_that_is_asked_for(
+    name: str, tmp_path: Path, caplog: Log
+) -> None:
+    """The scan that comes next is compared with the last good one, not with the refused."""
+    left_out(tmp_path / "one", caplog, [JUMPS[name]], "pose_jump", reject_jumps=True)
     caplog.clear()
-    half = np.sqrt(0.5)
-    back = Pose(scan.pose.position, np.array([0.0, 0.02, half, half - 0.02]))
-    back = Pose(back.position, back.orientation_xyzw / np.linalg.norm(back.orientation_xyzw))
-    line = Line(tmp_path / "turned").take(
-        [*envelopes("r1", 1), scan_envelope(replace(scan, pose=back))]
-    )
-    assert line.account["pose_jump"] == 1
-    later = replace(scan, pose=there, stamp_ns=START_NS + 10**10)  # it had time to drive there
-    line = Line(tmp_path / "later").take([*envelopes("r1", 1), scan_envelope(later)])
+    twice = [JUMPS[name], at(0.5, after_ms=75.0, sequence=6)]
+    line = Line(tmp_path / "two", reject_jumps=True).take(around(twice))
+    assert line.account["rejected.pose_jump"] == 1
+    assert line.account["applied[r1/lidar]"] == 3
+
+
+@pytest.mark.parametrize("name", NO_JUMPS)
+def test_f15_what_is_no_jump_is_neither(name: str, tmp_path: Path) -> None:
+    for reject in (False, True):
+        line = Line(tmp_path / str(reject), reject_jumps=reject).take(around([NO_JUMPS[name]]))
+        assert line.account["pose_jump"] == line.account["rejected.pose_jump"] == 0
+        assert line.account["applied"] == 5
+
+
+def test_f15_a_robot_that_was_carried_away_is_heard_again(tmp_path: Path, caplog: Log) -> None:
+    """What is refused is not compared with: after 0.1 s of stamps nothing is a jump any more."""
+    there = [at(50.0, after_ms=25.0 * k, sequence=10 + k) for k in range(1, 9)]
+    line = Line(tmp_path, reject_jumps=True).take([*envelopes("r1", 1), *there])
+    assert line.account["rejected.pose_jump"] == 4
+    assert line.account["applied"] == 5
     assert line.account["pose_jump"] == 0
+    assert len(lines(caplog, "pose_jump")) == 1
 
 
 @pytest.mark.parametrize("stamp_ns", [0, 10**17, START_NS + 3 * 10**9], ids=["0", "1973", "future"])
@@ -229,6 +272,50 @@ def test_f17_stamps_out_of_order_give_the_same_map(tmp_path: Path, caplog: Log) 
     sorted_ = Line(tmp_path / "b").take([*envelopes("r1", 1, 2, 7), *envelopes("r2", 1)])
     assert line.state() == sorted_.state()
     assert sorted_.account["out_of_order"] == 0
+
+
+def rivals(sequence: int) -> tuple[Envelope, Envelope]:
+    """Two scans of one number: that with the smaller hash first. One has fewer points, and some
+    that are refused."""
+    spoiled = with_rows([[np.nan, 0, 0], [900, 0, 0], [2, 1, 0]], sequence)
+    pair = (scan_envelope(small_scan(sequence)), scan_envelope(spoiled))
+    better, worse = sorted(pair, key=lambda e: hashlib.sha256(e.payload).digest())
+    return better, worse
+
+
+@pytest.mark.parametrize("sequence", range(3, 9))
+def test_f18_of_two_scans_with_one_number_the_smaller_hash_wins(
+    sequence: int, tmp_path: Path, caplog: Log
+) -> None:
+    """Whichever came first: the other is taken out again, or never gets in. Counters are those of
+    the scans that are in the map, at every step (`Line.take` asserts the law)."""
+    better, worse = rivals(sequence)
+    clean = Line(tmp_path / "clean").take(around([better]))
+    orders = {"a": [better, worse], "b": [worse, better], "c": [worse, better, worse, better]}
+    for name, order in orders.items():
+        caplog.clear()
+        line = Line(tmp_path / name).take(around(order))
+        assert line.state() == clean.state()
+        account, expected = line.account, clean.account
+        left = len(order) - 1
+        assert account[f"conflict[{SOURCE}]"] + account[f"duplicate[{SOURCE}]"] == left
+        assert account[f"conflict[{SOURCE}]"] == (2 if name == "c" else 1)
+        for source in ("r1/lidar", "r2/lidar"):
+            assert account[f"applied[{source}]"] == expected[f"applied[{source}]"]
+            mine, theirs = account.balance(source), expected.balance(source)
+            assert mine.is_exact
+            assert mine.in_flight == 0
+            assert (mine.points_in, mine.points_stored, mine.points_rejected) == (
+                *(theirs.points_in, theirs.points_stored, theirs.points_rejected),
+            )
+        assert line.num_points() == account["points_stored"]
+        assert len(lines(caplog, "conflict")) == 1
+        kept = [decode(e) for e in line.log() if e.key == CONFLICT_TOPIC]
+        digest = hashlib.sha256(better.payload).digest()
+        assert [x.kept == digest for x in kept if isinstance(x, Conflict)] == (
+            [True, True] if name == "c" else [True]
+        )
+        assert [bytes(e.payload) for e in around(order)] == line.recorded()
 
 
 def test_f18_a_duplicate_is_applied_once(tmp_path: Path) -> None:

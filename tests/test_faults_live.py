@@ -1,4 +1,4 @@
-"""Faults of a running service (F19-F23, F26, F29, F30, F36; G13, G15): its threads in this
+"""Faults of a running service (F18-F23, F26, F29, F30, F36; G13, G15): its threads in this
 process, robots over real sessions."""
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ import psutil
 import pytest
 import zenoh
 
-from facet.config import NetworkSection, load_config
+from facet.commands.replay import replay_log
+from facet.config import Config, NetworkSection, load_config
 from facet.mapping.mapper import Mapper
 from facet.pipeline import Pipeline
 from facet.service import Service
@@ -29,7 +30,7 @@ from facet.sources.recording import Recording
 from facet.status import balance_of
 from facet_protocol import attachment, topics
 from facet_protocol.codec import decode
-from facet_protocol.messages import Loss, Status
+from facet_protocol.messages import Conflict, Loss, Status
 from fault_rig import SETTINGS, scans_in, small_scan
 from rig import START_NS, free_endpoint, scan_envelope, wait_until
 from test_commands import Running
@@ -45,6 +46,17 @@ def put(client: zenoh.Session, sequence: int, epoch: int = 5, robot: str = "r1")
     client.put(
         topics.scan_key("map", robot, "lidar"),
         PAYLOAD,
+        encoding="application/protobuf;foxglove.PointCloud",
+        congestion_control=zenoh.CongestionControl.BLOCK,
+        attachment=attachment.pack(epoch, sequence, START_NS + sequence),
+    )
+
+
+def put_scan(client: zenoh.Session, sequence: int, epoch: int, robot: str = "r1") -> None:
+    """One scan with points of its own."""
+    client.put(
+        topics.scan_key("map", robot, "lidar"),
+        scan_envelope(small_scan(sequence, robot)).payload,
         encoding="application/protobuf;foxglove.PointCloud",
         congestion_control=zenoh.CongestionControl.BLOCK,
         attachment=attachment.pack(epoch, sequence, START_NS + sequence),
@@ -113,6 +125,80 @@ def test_f21_two_publishers_under_one_name(tmp_path: Path, caplog: Log) -> None:
         in_balance(service)
         service.stop()
     assert len([m for m in caplog.messages if "two publishers share the name" in m]) == 1
+
+
+def test_f21_strict_the_second_publisher_is_refused(tmp_path: Path, caplog: Log) -> None:
+    """The alarm stays; what is refused is recorded, and leaves no trace in the map or its replay;
+    a robot that begins anew is no second one, and others go on."""
+    with running(tmp_path, **{"robots.strict": True}) as (service, _, client):
+        wait_for_ear(client)
+        for sequence in (1, 2, 3):
+            put_scan(client, sequence, epoch=5)
+            put_scan(client, 10 + sequence, epoch=6)
+            put_scan(client, sequence, epoch=6 + (sequence == 3), robot="r2")
+        account = service.account
+        wait_until(lambda: account.balance().received == 9 and not account.balance().in_flight, 60)
+        assert account["rejected.duplicate_publisher[r1/lidar]"] == 2
+        assert account["rejected.duplicate_publisher"] == account.balance().rejected == 2
+        assert account["duplicate_publisher[r1/lidar]"] == 4
+        assert account["applied[r2/lidar]"] == 3
+        assert account["source_restarted[r2/lidar]"] == 1
+        said = [m for m in caplog.messages if m.startswith("r1/lidar: duplicate_publisher: ")]
+        assert len(said) == 1
+        in_balance(service)
+        model = service.stop()
+    expected = Mapper(SETTINGS)
+    for sequence in (1, 2, 3, 11):
+        expected.insert(small_scan(sequence))
+    for sequence in (1, 2, 3):
+        expected.insert(small_scan(sequence, "r2"))
+    expected.update()
+    assert model is not None
+    assert model["digest"]["state"] == expected.digest().state
+    replayed = replay_log([tmp_path], Config())
+    assert replayed.model()["digest"] == model["digest"]
+    assert replayed.left_out == {"duplicate_publisher": 2}
+    assert len(scans_in(tmp_path)) == 9
+
+
+def test_f18_conflicts_live_and_replayed(tmp_path: Path, caplog: Log) -> None:
+    """Two publishers with one epoch: every number comes twice, with other bytes. The map is the
+    same as if the two had come the other way round, and as that of the replay."""
+    digests = []
+    for name, turn in (("a", 0), ("b", 1)):
+        with running(tmp_path / name) as (service, _, client):
+            wait_for_ear(client)
+            for sequence in (1, 2, 3, 4):
+                pair = (small_scan(sequence), small_scan(sequence, num=200))
+                for scan in (pair[turn], pair[1 - turn]):
+                    client.put(
+                        KEY,
+                        scan_envelope(scan).payload,
+                        encoding="application/protobuf;foxglove.PointCloud",
+                        congestion_control=zenoh.CongestionControl.BLOCK,
+                        attachment=attachment.pack(5, sequence, scan.stamp_ns),
+                    )
+                put(client, sequence, robot="r2")
+            wait_until(lambda: service.account["applied"] == 8, 60)
+            wait_until(lambda: service.account["conflict"] == 4)
+            assert service.account["conflict[r1/lidar]"] == 4
+            in_balance(service)
+            assert service.account.balance().in_flight == 0
+            model = service.stop()
+        assert model is not None
+        balance = service.account.balance()
+        assert balance.points_stored == model["counts"]["points_stored"]
+        digests.append(model["digest"])
+        replayed = replay_log([tmp_path / name], Config())
+        assert replayed.model()["digest"] == model["digest"]
+        assert replayed.model()["planes"] == model["planes"]
+        assert replayed.account["conflict"] == 4
+        assert replayed.account.balance().is_exact
+        logged = [decode(e) for e in Recording([tmp_path / name]) if e.key == topics.CONFLICT_TOPIC]
+        assert [x.sequence for x in logged if isinstance(x, Conflict)] == [1, 2, 3, 4]
+    assert digests[0] == digests[1]
+    said = [m for m in caplog.messages if m.startswith("r1/lidar: conflict: ")]
+    assert len(said) == 4  # a line a run, and a line a replay
 
 
 @pytest.mark.parametrize("step_s", [-86400, 86400])

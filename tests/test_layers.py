@@ -31,9 +31,9 @@ class Layer(NamedTuple):
 EVERYTHING = Layer("facet.* facet_protocol.*", "*")
 SHELL = Layer(
     "facet facet.admission facet.config facet.corrections facet.firsts facet.frames "
-    "facet.mapping.* facet.outgoing facet.past facet.pipeline facet.plausibility facet.resolution "
-    "facet.sequences facet.sinks facet.sources.naming facet.standing facet.status "
-    "facet.trajectory facet_protocol.*"
+    "facet.mapping.* facet.outgoing facet.past facet.pipeline facet.placement facet.plausibility "
+    "facet.publishers facet.resolution facet.rivals facet.sequences facet.sinks "
+    "facet.sources.naming facet.standing facet.status facet.trajectory facet_protocol.*"
 )
 WIRING = Layer(  # the threads of the running service: they join sources and sinks by hand
     f"{SHELL.ours} facet.intake facet.robots facet.session facet.sinks.* facet.sources.*"
@@ -61,6 +61,7 @@ LAYERS = {  # the longest name that fits counts
     "facet.config": Layer("", "pydantic"),
     "facet.frames": Layer("facet_protocol.*", pure=True),
     "facet.past": Layer("facet.sinks.log_file facet.sources.* facet_protocol.*"),
+    "facet.publishers": Layer("", pure=True),
     "facet.resolution": Layer("facet.frames facet_protocol.*", pure=True),
     "facet.robots": Layer(
         "facet.admission facet.config facet.past facet.sources.dialects facet.status "

@@ -29,13 +29,18 @@ PROMISES: dict[str, str] = {
     "F12": "faults::left_out",
     "F13": "faults::left_out",
     "F14": "faults::f14_a_scan_waits_for_its_pose_and_then_no_longer",
-    "F15": "faults::f15_a_jump_is_flagged",
+    "F15": "faults::f15_a_jump_is_flagged faults::f15_a_jump_is_refused_where_that_is_asked_for "
+    "faults::f15_a_robot_that_was_carried_away_is_heard_again",
     "F16": "faults::f16_a_stamp_from_no_clock_is_counted faults::left_out",
     "F17": "faults::f17_stamps_out_of_order_give_the_same_map",
-    "F18": "faults::f18_a_duplicate_is_applied_once",
+    "F18": "faults::f18_a_duplicate_is_applied_once "
+    "faults::f18_of_two_scans_with_one_number_the_smaller_hash_wins "
+    "faults_live::f18_conflicts_live_and_replayed rivals::whatever_comes_first "
+    "rivals::beyond_the_horizon_the_first_stays_and_it_is_counted",
     "F19": "faults_live::f19_gaps_and_late_arrivals sequences::*",
     "F20": "faults_live::f20_a_publisher_that_begins_anew",
-    "F21": "faults_live::f21_two_publishers_under_one_name",
+    "F21": "faults_live::f21_two_publishers_under_one_name "
+    "faults_live::f21_strict_the_second_publisher_is_refused publishers::*",
     "F22": "faults_live::f22_the_clock_steps recorder::log_time_never_goes_back",
     "F23": "faults_live::g15_overload live::half_full_the_network_waits_and_then_no_longer",
     "F24": "stalls::g14_the_service_stalls",
@@ -108,10 +113,6 @@ PROMISES: dict[str, str] = {
 }
 
 NOT_YET = {
-    "F18": "of two scans with one number and different bytes the first wins, and the other is "
-    "counted as a duplicate: the smaller hash can only win where the loser can be taken out",
-    "F15": "jumps are flagged; there is no option to refuse them",
-    "F21": "the alarm is raised; there is no strict mode that refuses the second publisher",
     "P7": "the map is not sharded: the halo is tested by breaking it",
     "P12": "0.2 mm and 1e-4 rad are not reached in a small noisy room: 1 mm and 5e-4 rad are",
     "S12": "see test_security.py",

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from facet.admission import Admission, Admitted
+from facet.admission import Admission
+from facet.placement import Admitted
 from facet.status import Account
 from facet_protocol import topics
 from facet_protocol.codec import encode

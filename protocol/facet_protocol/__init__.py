@@ -12,6 +12,7 @@ from facet_protocol.codec import (
     facet_descriptors,
 )
 from facet_protocol.messages import (
+    Conflict,
     Corrected,
     CorrectedPose,
     Correction,
@@ -49,6 +50,7 @@ from facet_protocol.scene import encode_scene, encode_tiles_cloud
 __all__ = [
     "SCHEMAS",
     "Attachment",
+    "Conflict",
     "Corrected",
     "CorrectedPose",
     "Correction",

@@ -19,6 +19,7 @@ from google.protobuf.message import Message as Protobuf
 
 from facet_protocol import maps, poses, records, scans
 from facet_protocol.messages import (
+    Conflict,
     Corrected,
     Correction,
     Cut,
@@ -57,6 +58,7 @@ Message = (
     | ResolvedPose
     | Correction
     | Corrected
+    | Conflict
     | Loss
 )
 
@@ -121,6 +123,9 @@ SCHEMAS: dict[str, Schema] = {
     ),
     "facet.v1.Corrected": _row(
         Corrected, records.encode_corrected, records.decode_corrected, service_pb2.Corrected
+    ),
+    "facet.v1.Conflict": _row(
+        Conflict, records.encode_conflict, records.decode_conflict, service_pb2.Conflict
     ),
     "facet.v1.Loss": _row(Loss, records.encode_loss, records.decode_loss, service_pb2.Loss),
 }

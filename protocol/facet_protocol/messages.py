@@ -182,6 +182,20 @@ class Corrected:
     reason: str = ""  # why none of it was applied; "": all of it was
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Conflict:
+    """Two different scans under one number: that with the smaller SHA-256 is in the map."""
+
+    robot: str
+    sensor: str
+    epoch: int
+    sequence: int
+    stamp_ns: int  # of the one that came last
+    kept: bytes  # (32,) SHA-256 of the payload that is in the map
+    left_out: bytes  # (32,) of the other
+    replaced: bool  # the one that came last is kept: the other was taken out again
+
+
 class PlaneClass(StrEnum):
     FLOOR = "floor"
     CEILING = "ceiling"

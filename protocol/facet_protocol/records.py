@@ -1,8 +1,9 @@
-"""Status, cuts, resolved poses, corrections and losses as facet.v1."""
+"""Status, cuts, resolved poses, corrections, conflicts and losses as facet.v1."""
 
 from __future__ import annotations
 
 from facet_protocol.messages import (
+    Conflict,
     Corrected,
     CorrectedPose,
     Correction,
@@ -119,6 +120,25 @@ def encode_corrected(corrected: Corrected) -> bytes:
 def decode_corrected(payload: bytes | memoryview) -> Corrected:
     m = parse(pb.Corrected, payload)
     return Corrected(m.robot, m.epoch, m.sequence, m.stamp_ns, m.num_scans, m.reason)
+
+
+def encode_conflict(conflict: Conflict) -> bytes:
+    return pb.Conflict(
+        robot=conflict.robot,
+        sensor=conflict.sensor,
+        epoch=conflict.epoch,
+        sequence=conflict.sequence,
+        stamp_ns=conflict.stamp_ns,
+        kept=conflict.kept,
+        left_out=conflict.left_out,
+        replaced=conflict.replaced,
+    ).SerializeToString(deterministic=True)
+
+
+def decode_conflict(payload: bytes | memoryview) -> Conflict:
+    m = parse(pb.Conflict, payload)
+    numbers = (m.epoch, m.sequence, m.stamp_ns)
+    return Conflict(m.robot, m.sensor, *numbers, m.kept, m.left_out, m.replaced)
 
 
 def encode_loss(loss: Loss) -> bytes:

@@ -14,7 +14,10 @@ from facet.corrections import Corrections
 from facet.firsts import Firsts
 from facet.frames import Rank
 from facet.past import Past, at_once
+from facet.placement import Admitted, Dismissed, Placement
+from facet.publishers import Publishers
 from facet.resolution import Resolution, Settled
+from facet.rivals import Rivals
 from facet.sources.naming import (
     POSE_SCHEMAS,
     TRANSFORM_SCHEMAS,
@@ -41,6 +44,7 @@ from facet_protocol.messages import (
 from facet_protocol.ros_definitions import ODOMETRY
 from facet_protocol.scans import decode_scan
 from facet_protocol.topics import (
+    CONFLICT_TOPIC,
     CORRECTED_TOPIC,
     PREFIX,
     RESOLVED_TOPIC,
@@ -53,14 +57,6 @@ WAIT_NS = 500_000_000  # of stamps: for a scan's pose, and between two poses
 WAIT_BYTES = 256 << 20  # of scans that wait
 
 
-class Admitted(NamedTuple):
-    """A scan to insert; `resolved` when it came apart from its pose."""
-
-    envelope: Envelope
-    scan: Scan
-    resolved: ResolvedPose | None = None
-
-
 class Moved(NamedTuple):
     """Scans to be moved, all of them: as they are in the map, and as they are to be. None when the
     correction was refused; `corrected` is what became of it."""
@@ -70,12 +66,17 @@ class Moved(NamedTuple):
     corrected: Corrected
 
 
+Outcome = Admitted | Dismissed | Moved
+
+
 class Admission:
     """Turns envelopes into scans, in log order, and counts what it leaves out under its reason.
 
     `logged`: the log says with which poses scans were applied, and what became of corrections. What
     does not have its pose with it waits for it in `Resolution`, a correction for its points in
     `Corrections`; `past` is where those are found.
+    `reject_jumps`: a scan whose pose jumps is refused, not only flagged. `strict`: so are those of
+    a second publisher under one name.
     """
 
     def __init__(
@@ -88,33 +89,49 @@ class Admission:
         wait_bytes: int = WAIT_BYTES,
         logged: bool = False,
         past: Past | None = None,
+        reject_jumps: bool = False,
+        strict: bool = False,
     ) -> None:
         self.past = past or Past()
         self._account = account
+        self._publishers = Publishers() if strict else None
         self._frame_id, self._reach_m = frame_id, reach_m
         self._resolution = Resolution(frame_id, wait_ns, wait_bytes, logged=logged)
         self._firsts = Firsts()
         self._trajectories = Trajectories()
+        rivals = Rivals(self.past)
         self.corrections = Corrections(
             frame_id,
             self._firsts,
             self._trajectories,
+            rivals,
             lambda envelope: self._decode(_inner(envelope)),
             at_once(self.past),
             logged=logged,
         )
+        self._placement = Placement(
+            account,
+            self._firsts,
+            self._trajectories,
+            rivals,
+            self.corrections.as_mapped,
+            reject_jumps=reject_jumps,
+        )
 
     def report_to(self, account: Account) -> None:
         """Count there from now on, also what waits."""
-        self._account = account
+        self._account = self._placement.account = account
         for envelope in (*self._resolution.waiting(), *self.corrections.waiting()):
             account.arrive(source_of(envelope))
 
     def freeze(self) -> dict[str, NDArray[Any]]:
         """What it remembers, for a checkpoint."""
+        publishers = self._publishers.freeze() if self._publishers is not None else {}
         return {
+            **publishers,
             **self._firsts.freeze(),
             **self._trajectories.freeze(),
+            **self._placement.freeze(),
             **self.past.freeze(),
             **freeze_resolution(self._resolution),
         }
@@ -124,14 +141,19 @@ class Admission:
         TypeError, ValueError for anything else."""
         self._firsts.thaw(frozen)
         self._trajectories.thaw(frozen)
+        self._placement.thaw(frozen)
+        if self._publishers is not None:
+            self._publishers.thaw(frozen)
         self.past.thaw(frozen, directory)
         thaw_resolution(self._resolution, frozen, lambda e: self._decode(_inner(e)))
 
-    def admit(self, envelope: Envelope) -> Sequence[Admitted | Moved]:
+    def admit(self, envelope: Envelope) -> Sequence[Outcome]:
         """The scans to insert: this one, or such as have waited for this pose; or to be moved.
         Often none."""
         if envelope.key in (RESOLVED_TOPIC, CORRECTED_TOPIC):
             return self._confirm(envelope)
+        if envelope.key == CONFLICT_TOPIC:
+            return []  # the scans themselves say the same
         if is_correction(envelope):
             return self._admit_correction(envelope)
         source = source_of(envelope)
@@ -158,7 +180,7 @@ class Admission:
         """Corrections whose points have come."""
         return self._take_moved(self.corrections.go_on())
 
-    def finish(self, timeout_s: float | None = None) -> Sequence[Admitted | Moved]:
+    def finish(self, timeout_s: float | None = None) -> Sequence[Outcome]:
         """No message will come any more: what waits for a pose is placed now, or refused; what
         waits for points does so for as long as that, each."""
         placed = self._take(self._resolution.finish())
@@ -166,22 +188,29 @@ class Admission:
             return [*placed, *self._take_moved(self.corrections.go_live())]
         return [*placed, *self._take_moved(self.corrections.go_on(timeout_s))]
 
-    def go_live(self) -> Sequence[Admitted | Moved]:
+    def go_live(self) -> Sequence[Outcome]:
         """The log ends here: what it does not say is found from the poses that come, and from
         what it holds."""
         placed = self._take(self._resolution.go_live())
         return [*placed, *self._take_moved(self.corrections.go_live())]
 
-    def _admit_scan(self, envelope: Envelope, inner: Envelope, source: str) -> list[Admitted]:
+    def _admit_scan(self, envelope: Envelope, inner: Envelope, source: str) -> Sequence[Outcome]:
         scan = self._decode(inner)
-        if not self._firsts.is_first(envelope, scan.source):
-            self._account.settle(source, "duplicate")
+        self._check_publisher(envelope, source)
+        if not self._placement.meets(envelope, source):
             return []
         if scan.renormalised:
             self._account.count("renormalised", source)
         if scan.frame_id == self._frame_id:
-            return [Admitted(envelope, scan)]
+            return [self._placement.place(envelope, scan)]
         return self._take(self._resolution.hold(envelope, scan))
+
+    def _check_publisher(self, envelope: Envelope, source: str) -> None:
+        """Raises ProtocolError for a second one, where only one may speak."""
+        numbers = (envelope.epoch, envelope.sequence)
+        if self._publishers is not None and not self._publishers.admits(source, *numbers):
+            text = f"epoch {envelope.epoch} speaks under the name of another that is still there"
+            raise ProtocolError(text, "duplicate_publisher")
 
     def _decode(self, envelope: Envelope) -> Scan:
         """The scan, with what is to be known of its frame. Raises ProtocolError."""
@@ -201,7 +230,7 @@ class Admission:
             raise ProtocolError(f"{envelope.schema}: {text}", "wrong_frame")
         return scan
 
-    def _admit_pose(self, envelope: Envelope, inner: Envelope, source: str) -> list[Admitted]:
+    def _admit_pose(self, envelope: Envelope, inner: Envelope, source: str) -> Sequence[Outcome]:
         if envelope.key.startswith(f"{PREFIX}/"):
             parse_pose_key(envelope.key)
         message = decode(inner)
@@ -238,7 +267,7 @@ class Admission:
             return []
         return self._take_moved(self.corrections.take(envelope))
 
-    def _confirm(self, envelope: Envelope) -> Sequence[Admitted | Moved]:
+    def _confirm(self, envelope: Envelope) -> Sequence[Outcome]:
         """The log says with which pose a scan was applied, or what became of a correction."""
         try:
             message = decode(envelope)
@@ -258,9 +287,9 @@ class Admission:
             moved.append(Moved(envelope, scans, corrected))
         return moved
 
-    def _take(self, settled: Iterable[Settled]) -> list[Admitted]:
+    def _take(self, settled: Iterable[Settled]) -> list[Outcome]:
         """What was placed, with the record of it; what was refused is counted."""
-        admitted = []
+        admitted: list[Outcome] = []
         for envelope, scan, error in settled:
             if error is not None:
                 self._refuse(source_of(envelope), error)
@@ -274,13 +303,11 @@ class Admission:
                 frame_id=self._frame_id,
                 pose=scan.pose,
             )
-            self._trajectories.note(scan.source, envelope.epoch, envelope.sequence, scan.pose)
-            admitted.append(Admitted(envelope, scan, resolved))
+            admitted.append(self._placement.place(envelope, scan, resolved))
         return admitted
 
     def _refuse(self, source: str, error: ProtocolError) -> None:
-        self._account.settle(source, f"rejected.{error.reason}")
-        self._account.complain(source, error.reason, str(error))
+        self._placement.refuse(source, error)
 
 
 def _inner(envelope: Envelope) -> Envelope:

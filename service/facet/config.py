@@ -173,6 +173,8 @@ class RobotsSection(Section):
     rules: tuple[RuleSection, ...] = ()  # the first that fits counts
     wait_s: float = Field(default=0.5, gt=0.0, le=60.0)  # of stamps: for a pose, and between two
     wait_bytes: int = Field(default=256 * MIB, ge=MIB, le=65536 * MIB)  # of scans that wait
+    reject_jumps: bool = False  # a pose 5 m or 90 degrees off at once: refused, not only flagged
+    strict: bool = False  # a second publisher under one name: refused, not only an alarm
 
 
 class PublishSection(Section):

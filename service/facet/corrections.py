@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 from facet.firsts import Firsts, is_loose
 from facet.past import Found, Number
+from facet.rivals import Rivals
 from facet.sources.naming import names_of
 from facet.trajectory import Name, Trajectories
 from facet_protocol.codec import decode
@@ -64,6 +65,7 @@ class Corrections:
         frame_id: str,
         firsts: Firsts,
         trajectories: Trajectories,
+        rivals: Rivals,
         decode_scan: Decode,
         ask: Ask,
         *,
@@ -71,7 +73,7 @@ class Corrections:
     ) -> None:
         self.ask = ask
         self._frame_id, self._firsts, self._trajectories = frame_id, firsts, trajectories
-        self._decode_scan, self._logged = decode_scan, logged
+        self._rivals, self._decode_scan, self._logged = rivals, decode_scan, logged
         self._held: deque[Held] = deque()
 
     def __len__(self) -> int:
@@ -158,7 +160,7 @@ class Corrections:
         """Move all of its scans, or none."""
         try:
             found = question.result()
-            old = [self._as_mapped(number, found.get(number, [])) for number in held.numbers]
+            old = [self.as_mapped(number, found.get(number, [])) for number in held.numbers]
             moved: defaultdict[Name, list[tuple[int, Pose]]] = defaultdict(list)
             for number, pose in zip(held.numbers, held.poses, strict=True):
                 moved[number.source, number.epoch].append((number.sequence, pose))
@@ -173,8 +175,11 @@ class Corrections:
         scans = tuple((scan, replace(scan, pose=pose)) for scan, pose in pairs)
         return Settled(held.envelope, self._record(held.envelope, len(scans)), scans)
 
-    def _as_mapped(self, number: Number, candidates: Sequence[Envelope]) -> Scan:
-        """The scan with the pose that it has in the map. Raises ProtocolError when it has none."""
+    def as_mapped(self, number: Number, candidates: Sequence[Envelope]) -> Scan:
+        """The scan with the pose that it has in the map. Raises ProtocolError when it has none, and
+        OSError. The first good candidate is it, unless a rival of it is."""
+        rival = self._rivals.in_map(number)
+        candidates = candidates if rival is None else [rival]
         if len({(e.stamp_ns, bytes(e.payload)) for e in candidates if is_loose(e)}) > 1:
             text = f"{number.source}: several scans have the number {number.sequence}"
             raise ProtocolError(text, "ambiguous_scan")

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 
 from facet.sources.naming import CORRECTION, is_correction, is_input, is_scan, names_of
 from facet_protocol import topics
 from facet_protocol.codec import decode
-from facet_protocol.messages import Corrected, Cut, Envelope, ProtocolError, ResolvedPose
+from facet_protocol.messages import (
+    Conflict,
+    Corrected,
+    Cut,
+    Envelope,
+    ProtocolError,
+    ResolvedPose,
+)
 
 EVERY_NS = 200_000_000  # of log time, for a log that does not say
-RECORDS = (topics.RESOLVED_TOPIC, topics.CORRECTED_TOPIC)
+RECORDS = (topics.RESOLVED_TOPIC, topics.CORRECTED_TOPIC, topics.CONFLICT_TOPIC)
 Identity = tuple[str, str, int, int, int]  # robot, sensor, epoch, sequence, stamp
+Record = ResolvedPose | Corrected | Conflict
 
 
 class Batch(list[Envelope]):
@@ -89,32 +99,49 @@ def _cut(envelope: Envelope) -> Cut | None:
 
 def _split(waiting: list[Envelope], cuts: list[Cut]) -> tuple[list[Envelope], list[Envelope]]:
     """(applied before the cut, after it): up to the last scan that one of its rows names, or whose
-    pose was found before it, or the last correction that was settled, and the records of both."""
-    named = {(c.robot, c.sensor, c.epoch, c.sequence, c.stamp_ns) for c in cuts}
-    named |= {identity for e in waiting if (identity := _recorded_identity(e)) is not None}
+    pose was found before it, or that took the place of another, or the last correction that was
+    settled, and the records of them."""
+    records = [record for e in waiting if (record := _record(e)) is not None]
+    named = Counter(_recorded_identity(r) for r in records if not isinstance(r, Conflict))
+    for cut in cuts:
+        identity = (cut.robot, cut.sensor, cut.epoch, cut.sequence, cut.stamp_ns)
+        named[identity] = max(1, named[identity])
+    winners = {(_recorded_identity(r), r.kept) for r in records if isinstance(r, Conflict)}
     end = 0
     for k, envelope in enumerate(waiting):
+        if not is_scan(envelope) and not is_correction(envelope):
+            continue
         identity = _identity(envelope)
-        if identity in named and (is_scan(envelope) or is_correction(envelope)):
-            named.discard(identity)  # a duplicate further on was left out
+        if named[identity] > 0:
+            named[identity] -= 1  # a duplicate further on was left out
             end = k + 1
-    records = [e for e in waiting[end:] if e.key in RECORDS]
-    return waiting[:end] + records, [e for e in waiting[end:] if e.key not in RECORDS]
+        elif winners and (winner := (identity, _digest(envelope))) in winners:
+            winners.discard(winner)
+            end = k + 1
+    said = [e for e in waiting[end:] if e.key in RECORDS]
+    return waiting[:end] + said, [e for e in waiting[end:] if e.key not in RECORDS]
 
 
-def _recorded_identity(envelope: Envelope) -> Identity | None:
-    """Of the scan or correction that a record is about."""
+def _record(envelope: Envelope) -> Record | None:
+    """What became of a scan or a correction, where it says that something came of it."""
     if envelope.key not in RECORDS:
         return None
     try:
         message = decode(envelope)
     except ProtocolError:
         return None
-    if isinstance(message, Corrected):
-        return message.robot, CORRECTION, message.epoch, message.sequence, message.stamp_ns
-    if not isinstance(message, ResolvedPose):
-        return None
-    return message.robot, message.sensor, message.epoch, message.sequence, message.stamp_ns
+    if isinstance(message, Conflict):
+        return message if message.replaced else None
+    return message if isinstance(message, Corrected | ResolvedPose) else None
+
+
+def _recorded_identity(record: Record) -> Identity:
+    sensor = CORRECTION if isinstance(record, Corrected) else record.sensor
+    return record.robot, sensor, record.epoch, record.sequence, record.stamp_ns
+
+
+def _digest(envelope: Envelope) -> bytes:
+    return hashlib.sha256(envelope.payload).digest()
 
 
 def _identity(envelope: Envelope) -> Identity:

@@ -7,18 +7,31 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from facet.admission import Admission, Admitted, Moved
+from facet.admission import Admission, Moved, Outcome
 from facet.mapping.mapper import Mapper
 from facet.mapping.quantise import quantise
 from facet.outgoing import Outgoing
-from facet.plausibility import Plausibility
+from facet.placement import Admitted
 from facet.sinks import Message, Sink
 from facet.sources.naming import source_of
 from facet.status import Account
 from facet_protocol import topics
-from facet_protocol.messages import Corrected, Cut, Envelope, MapUpdate, ResolvedPose, Scan
+from facet_protocol.messages import (
+    Conflict,
+    Corrected,
+    Cut,
+    Envelope,
+    MapUpdate,
+    ResolvedPose,
+    Scan,
+)
 
 Tile = tuple[int, int, int]
+RECORD_TOPICS = {
+    ResolvedPose: topics.RESOLVED_TOPIC,
+    Corrected: topics.CORRECTED_TOPIC,
+    Conflict: topics.CONFLICT_TOPIC,
+}
 
 
 @dataclass(slots=True)
@@ -49,8 +62,8 @@ class Pipeline:
         self._mapper, self._admission, self._account = mapper, admission, account
         self._sinks, self._outgoing = tuple(sinks), outgoing
         self._points_every_ns = points_every_ns  # 0: points are not sent
-        self._plausibility = Plausibility()
         self._applied: dict[str, Applied] = {}
+        self._replaced: list[Conflict] = []  # since the last update
         self._changed_tiles: set[Tile] = set()
         self._points_sent_ns = 0
         self.revision = 0
@@ -59,7 +72,7 @@ class Pipeline:
 
     def take_over(self, other: Pipeline) -> None:
         """Go on where a pipeline of the same map and admission has ended."""
-        self._applied = other._applied
+        self._applied, self._replaced = other._applied, other._replaced
         self._changed_tiles = other._changed_tiles
         self.revision, self.log_time_ns = self._mapper.revision, other.log_time_ns
         self.is_stale = other.is_stale
@@ -71,7 +84,10 @@ class Pipeline:
         return self._apply(self._admission.admit(envelope))
 
     def go_live(self) -> None:
-        """The log that was read ends here: what comes now is new."""
+        """The log that was read ends here: what comes now is new. It may lack the record of what
+        was replaced since its last cut."""
+        for conflict in self._replaced:
+            self._say(conflict)
         self._apply(self._admission.go_live())
 
     def go_on(self) -> bool:
@@ -83,45 +99,56 @@ class Pipeline:
         """The map is what the log says, up to the last message that was taken."""
         return not self.is_stale and not self._admission.num_correcting
 
-    def _apply(self, admitted: Sequence[Admitted | Moved]) -> bool:
+    def _apply(self, admitted: Sequence[Outcome]) -> bool:
         num_changes = 0
         for one in admitted:
             if isinstance(one, Moved):
                 self._move(one)
-                self._say(topics.CORRECTED_TOPIC, one.corrected)
+                self._say(one.corrected)
                 num_changes += len(one.scans)
                 continue
-            self._insert(one.envelope, one.scan)
-            if one.resolved is not None:
-                self._say(topics.RESOLVED_TOPIC, one.resolved)
-            num_changes += 1
+            if isinstance(one, Admitted):
+                self._take(one)
+                num_changes += 1
+            for record in one.records:
+                self._say(record)
         return num_changes > 0
 
-    def _say(self, topic: str, message: ResolvedPose | Corrected) -> None:
+    def _say(self, message: ResolvedPose | Corrected | Conflict) -> None:
+        topic = RECORD_TOPICS[type(message)]
         said = self._outgoing.address(topic, message, message.stamp_ns, self.log_time_ns)
         self._emit((said,))
 
     def _move(self, moved: Moved) -> None:
-        """Take scans out where they are, and put them in where they are to be: exactly."""
+        """Scans from where they are to where they are to be."""
         for old, new in moved.scans:
-            out = quantise(old, self._mapper.settings)
-            self._mapper.retract(old)
-            inserted = self._mapper.insert(new)
-            changes = Counter(inserted.rejected)
-            changes.subtract(out.rejected)
-            points = {f"points_rejected.{reason}": num for reason, num in changes.items()}
-            points["points_stored"] = inserted.points_stored - len(out.points)
+            points = self._exchange(old, new)
             self._account.settle(new.source, "scans_corrected", 0, {"scans_corrected": 1, **points})
         if moved.scans:
             self._account.settle(source_of(moved.envelope), "used_as_correction")
             self.is_stale = True
 
-    def _insert(self, envelope: Envelope, scan: Scan) -> None:
-        inserted = self._mapper.insert(scan)
-        self._count(scan, inserted.points_stored, inserted.rejected)
-        for name, text in self._plausibility.oddities(scan, envelope.received_ns).items():
-            self._account.count(name, scan.source)
-            self._account.complain(scan.source, name, text)
+    def _exchange(self, old: Scan, new: Scan) -> dict[str, int]:
+        """Take one scan out and put another in, exactly; by how much the counters of points move.
+
+        What is in them of a scan that is taken out goes with it, so that points in = stored +
+        rejected holds, and each of them, of the scans that are in the map."""
+        out = quantise(old, self._mapper.settings)
+        self._mapper.retract(old)
+        inserted = self._mapper.insert(new)
+        changes = Counter(_points(new, inserted.points_stored, inserted.rejected))
+        changes.subtract(_points(old, len(out.points), out.rejected))
+        return dict(changes)
+
+    def _take(self, admitted: Admitted) -> None:
+        envelope, scan, records, replaced = admitted
+        if replaced is not None:
+            self._account.settle(scan.source, "conflict", also=self._exchange(replaced, scan))
+            self._replaced += [record for record in records if isinstance(record, Conflict)]
+        else:
+            inserted = self._mapper.insert(scan)
+            points = _points(scan, inserted.points_stored, inserted.rejected)
+            self._account.settle(scan.source, "applied", also=points)
         previous = self._applied.get(scan.source)
         num_scans = (previous.num_scans if previous else 0) + 1
         self._applied[scan.source] = Applied(envelope, scan, num_scans)
@@ -133,6 +160,7 @@ class Pipeline:
         stopwatch = Stopwatch()
         update = self._mapper.update(stopwatch)
         self.is_stale = False
+        self._replaced = []
         self.revision = update.revision
         self._account.stages(stopwatch.stage_ms)
         self._account.count("updates")
@@ -169,7 +197,7 @@ class Pipeline:
                 )
             )
             applied.num_scans = 0
-        return cuts
+        return cuts or [Cut(update.revision, "", "", 0, 0, 0, 0)]  # of corrections alone
 
     def _send_points(self, update: MapUpdate | None) -> None:
         due = self.log_time_ns - self._points_sent_ns >= self._points_every_ns
@@ -186,13 +214,14 @@ class Pipeline:
             for sink in self._sinks:
                 sink.write(envelope, message)
 
-    def _count(self, scan: Scan, points_stored: int, rejected: dict[str, int]) -> None:
-        """One instant for a scan and all its points: points in = stored + rejected."""
-        lost = Counter(rejected) + Counter(scan.ignored)
-        points = {f"points_rejected.{reason}": num for reason, num in lost.items()}
-        points["points_in"] = len(scan.points) + sum(scan.ignored.values())
-        points["points_stored"] = points_stored
-        self._account.settle(scan.source, "applied", also=points)
+
+def _points(scan: Scan, points_stored: int, rejected: dict[str, int]) -> dict[str, int]:
+    """What the points of a scan are counted under: points in = stored + rejected."""
+    lost = Counter(rejected) + Counter(scan.ignored)
+    points = {f"points_rejected.{reason}": num for reason, num in lost.items()}
+    points["points_in"] = len(scan.points) + sum(scan.ignored.values())
+    points["points_stored"] = points_stored
+    return points
 
 
 class Stopwatch:

@@ -44,6 +44,8 @@ def admission_of(
         wait_bytes=config.robots.wait_bytes,
         logged=logged,
         past=past or Past(dialects_of(config.robots)),
+        reject_jumps=config.robots.reject_jumps,
+        strict=config.robots.strict,
     )
 
 

@@ -21,12 +21,12 @@ logger = logging.getLogger(__name__)
 MAX_SOURCES = 256  # sources counted by name; a stranger cannot make the account grow for ever
 BURST_S = 10.0  # one line of log per source and reason in this time
 
-# Why a good message is not applied: it was there already; another with its number was chosen; the
-# queue, the disk or the time did not suffice for it; it has no points, and said where a sensor is,
-# or was.
+# Why a good message is not applied: it was there already; it may have been, too long ago to tell;
+# another with its number was chosen; the queue, the disk or the time did not suffice for it; it has
+# no points, and said where a sensor is, or was.
 LEFT_OUT = (
-    *("duplicate", "conflict", "shed_overload", "too_large", "unrecorded", "not_applied"),
-    *("used_as_pose", "used_as_correction"),
+    *("duplicate", "late_duplicate", "conflict", "shed_overload", "too_large", "unrecorded"),
+    *("not_applied", "used_as_pose", "used_as_correction"),
 )
 
 

@@ -37,6 +37,11 @@ class Track:
         k = int(np.searchsorted(self._sequences[: self._num], np.uint64(sequence)))
         return self._poses[k] if k < self._num and self._sequences[k] == sequence else None
 
+    def is_moved(self, sequence: int) -> bool:
+        k = int(np.searchsorted(self._sequences[: self._num], np.uint64(sequence)))
+        is_there = k < self._num and self._sequences[k] == sequence
+        return bool(is_there and self._is_moved[k])
+
     def put(
         self, sequences: NDArray[np.uint64], poses: NDArray[np.float64], *, is_moved: bool
     ) -> None:
@@ -100,6 +105,12 @@ class Trajectories:
         track = self._tracks.get((source, epoch))
         row = track.find(sequence) if track is not None else None
         return Pose(row[:3].copy(), row[3:].copy()) if row is not None else None
+
+    def corrected(self, source: str, epoch: int, sequence: int) -> Pose | None:
+        """The pose that a correction gave it."""
+        track = self._tracks.get((source, epoch))
+        is_moved = track is not None and track.is_moved(sequence)
+        return self.find(source, epoch, sequence) if is_moved else None
 
     def note(self, source: str, epoch: int, sequence: int, pose: Pose) -> None:
         """A pose that was found for a scan."""

@@ -86,6 +86,26 @@ class Corrected(_message.Message):
     reason: str
     def __init__(self, robot: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., num_scans: _Optional[int] = ..., reason: _Optional[str] = ...) -> None: ...
 
+class Conflict(_message.Message):
+    __slots__ = ("robot", "sensor", "epoch", "sequence", "stamp_ns", "kept", "left_out", "replaced")
+    ROBOT_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_FIELD_NUMBER: _ClassVar[int]
+    EPOCH_FIELD_NUMBER: _ClassVar[int]
+    SEQUENCE_FIELD_NUMBER: _ClassVar[int]
+    STAMP_NS_FIELD_NUMBER: _ClassVar[int]
+    KEPT_FIELD_NUMBER: _ClassVar[int]
+    LEFT_OUT_FIELD_NUMBER: _ClassVar[int]
+    REPLACED_FIELD_NUMBER: _ClassVar[int]
+    robot: str
+    sensor: str
+    epoch: int
+    sequence: int
+    stamp_ns: int
+    kept: bytes
+    left_out: bytes
+    replaced: bool
+    def __init__(self, robot: _Optional[str] = ..., sensor: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., kept: _Optional[bytes] = ..., left_out: _Optional[bytes] = ..., replaced: _Optional[bool] = ...) -> None: ...
+
 class Loss(_message.Message):
     __slots__ = ("robot", "sensor", "epoch", "first_sequence", "count", "reason", "stamp_ns")
     ROBOT_FIELD_NUMBER: _ClassVar[int]

@@ -21,10 +21,15 @@ from facet.sources.naming import is_correction, is_input, is_scan, names_of, sou
 from facet.sources.recording import Recording
 from facet_protocol import topics
 from facet_protocol.codec import decode
-from facet_protocol.messages import Corrected, Envelope, Loss, ProtocolError
+from facet_protocol.messages import Conflict, Corrected, Envelope, Loss, ProtocolError
 
 if TYPE_CHECKING:
     from facet.mapping.digest import Digest
+
+OWN_TOPICS = (
+    *(topics.CUT_TOPIC, topics.LOSS_TOPIC),
+    *(topics.CORRECTED_TOPIC, topics.CONFLICT_TOPIC),
+)
 
 
 @dataclass(slots=True)
@@ -47,6 +52,7 @@ class Contents:
     channels: dict[tuple[str, str], Channel] = field(default_factory=dict)  # by topic and schema
     scans: Counter[str] = field(default_factory=Counter)
     duplicates: Counter[str] = field(default_factory=Counter)
+    conflicts: Counter[bool] = field(default_factory=Counter)  # whether the later one was kept
     losses: Counter[str] = field(default_factory=Counter)  # what the log says of itself
     cuts: set[int] = field(default_factory=set)
     ledger: SequenceLedger = field(default_factory=SequenceLedger)
@@ -73,7 +79,7 @@ class Contents:
                 self.duplicates[source] += 1
         elif is_correction(envelope):
             self.corrections[names_of(envelope)[0]] += 1
-        elif envelope.key in (topics.CUT_TOPIC, topics.LOSS_TOPIC, topics.CORRECTED_TOPIC):
+        elif envelope.key in OWN_TOPICS:
             self._note_own(envelope)
 
     def _dialect(self, envelope: Envelope) -> str:
@@ -94,6 +100,8 @@ class Contents:
         elif isinstance(message, Corrected):
             self.outcomes[message.reason or "applied"] += 1
             self.num_moved += message.num_scans
+        elif isinstance(message, Conflict):
+            self.conflicts[message.replaced] += 1
         else:
             self.cuts.add(getattr(message, "revision", 0))
 
@@ -147,6 +155,11 @@ def _print_contents(recording: Recording, contents: Contents) -> None:
     out.print(f"{len(contents.cuts):,} updates were cut")
     if contents.corrections:
         _print_corrections(contents)
+    if contents.conflicts:
+        out.print(
+            f"{contents.conflicts.total():,} times a number came with other bytes: "
+            f"{contents.conflicts[True]:,} took the place of the scan before"
+        )
     for reason, num in sorted(contents.losses.items()):
         out.print(f"{num:,} scans {reason}, as the log says itself")
     metadata = recording.metadata.get("facet", {})

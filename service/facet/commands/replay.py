@@ -14,11 +14,14 @@ from facet.commands.play import parse_speed
 from facet.commands.settings import (
     DetailOption,
     FrameOption,
+    RejectJumpsOption,
+    StrictOption,
     ThetaOption,
     VoxelOption,
     make_mapper,
     mapping_overrides,
     recorded_settings,
+    robots_overrides,
 )
 from facet.commands.terminal import Exit, InputError, err, existing, out, progress, table
 from facet.config import Config, load_config
@@ -158,7 +161,8 @@ def _as_recorded(config: Config, head: dict[str, str]) -> Config:
         if config.map.frame == default.frame
         else config.map.frame,
     }
-    robots = config.robots if config.robots != Config().robots else recorded_robots(head)
+    given = {name: getattr(config.robots, name) for name in config.robots.model_fields_set}
+    robots = recorded_robots(head).model_copy(update=given)
     update = {"map": config.map.model_copy(update=names), "robots": robots}
     return config.model_copy(update=update)
 
@@ -204,6 +208,8 @@ def replay(
     report: Annotated[bool, typer.Option("--report", help="The four-stage table.")] = False,
     config: Annotated[Path | None, typer.Option(help="Settings (TOML).")] = None,
     frame: FrameOption = None,
+    reject_jumps: RejectJumpsOption = None,
+    strict: StrictOption = None,
     voxel: VoxelOption = None,
     theta: ThetaOption = None,
     detail_level: DetailOption = None,
@@ -217,7 +223,11 @@ def replay(
 
     A log that was cut off is read as far as it goes. Exit code 3: something was lost or left out.
     """
-    overrides = {"map.frame": frame, **mapping_overrides(voxel, theta, detail_level)}
+    overrides = {
+        "map.frame": frame,
+        **robots_overrides(reject_jumps, strict),
+        **mapping_overrides(voxel, theta, detail_level),
+    }
     settings = load_config(config, overrides)
     if update_every != "log":
         parse_every(update_every)

@@ -18,10 +18,13 @@ import typer
 
 from facet.commands.settings import (
     DetailOption,
+    RejectJumpsOption,
+    StrictOption,
     ThetaOption,
     VoxelOption,
     make_mapper,
     mapping_overrides,
+    robots_overrides,
 )
 from facet.commands.terminal import Exit, out, set_up_logging, table
 from facet.config import Config, load_config
@@ -59,6 +62,8 @@ def run(
     fresh: Annotated[
         bool, typer.Option("--fresh", help="Begin a new map; its log so far is set aside.")
     ] = False,
+    reject_jumps: RejectJumpsOption = None,
+    strict: StrictOption = None,
     voxel: VoxelOption = None,
     theta: ThetaOption = None,
     detail_level: DetailOption = None,
@@ -87,6 +92,7 @@ def run(
         "record.mode": "fast" if fast else None,
         "record.resume": False if fresh else None,
         "viewer": viewer,
+        **robots_overrides(reject_jumps, strict),
         **mapping_overrides(voxel, theta, detail_level),
     }
     raise typer.Exit(serve(load_config(config, overrides)))

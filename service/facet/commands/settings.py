@@ -26,6 +26,21 @@ DetailOption = Annotated[
 ]
 FrameOption = Annotated[str | None, typer.Option(help="Frame that poses are given in.")]
 
+RejectJumpsOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--reject-jumps/--accept-jumps",
+        help="Refuse scans whose pose jumps (5 m or 90 degrees at once), not only flag them.",
+    ),
+]
+StrictOption = Annotated[
+    bool | None,
+    typer.Option(
+        "--strict/--no-strict",
+        help="Refuse the scans of a second publisher under one name, not only raise the alarm.",
+    ),
+]
+
 
 def make_mapper(config: Config, recorded: Mapping[str, Any] | None = None) -> Mapper:
     """A mapper with the settings of a log it repeats, and over them those that were given."""
@@ -59,6 +74,11 @@ def recorded_settings(head: Mapping[str, str]) -> dict[str, Any]:
     except ValueError:
         return {}
     return settings if isinstance(settings, dict) else {}
+
+
+def robots_overrides(reject_jumps: bool | None, strict: bool | None) -> dict[str, Any]:
+    """The two as keys of the configuration."""
+    return {"robots.reject_jumps": reject_jumps, "robots.strict": strict}
 
 
 def mapping_overrides(

@@ -89,7 +89,10 @@ def is_replayed(envelope: Envelope) -> bool:
     return is_input(envelope) or envelope.key in _READ
 
 
-_READ = (topics.CUT_TOPIC, topics.LOSS_TOPIC, topics.RESOLVED_TOPIC, topics.CORRECTED_TOPIC)
+_READ = (
+    *(topics.CUT_TOPIC, topics.LOSS_TOPIC, topics.RESOLVED_TOPIC),
+    *(topics.CORRECTED_TOPIC, topics.CONFLICT_TOPIC),
+)
 
 
 def paced(

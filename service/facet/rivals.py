@@ -1,0 +1,266 @@
+"""Different scans under one number: the one whose payload has the smaller SHA-256 is in the map,
+in whatever order they came. No clock."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections import OrderedDict
+from collections.abc import Mapping
+from dataclasses import replace
+from enum import StrEnum
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from facet.firsts import is_loose
+from facet.past import Number, Past
+from facet.sequences import Numbers
+from facet_protocol.messages import Envelope, ProtocolError
+
+HORIZON = 8192  # scans of a source whose hashes are known: 200 s at 40 Hz, 49 bytes each
+MAX_SOURCES = 256  # whose scans are remembered: the one unheard for longest is forgotten
+WINDOW_BYTES = 16 << 20  # of the newest scans of all, as they came; an older one is in the log
+MAX_CHOSEN = 1 << 16  # numbers of which a later scan is in the map
+FIRST_ROWS = 64
+HASH_BYTES = 32
+
+
+class Claim(NamedTuple):
+    """A scan that wants to be the one of its number."""
+
+    number: Number
+    digest: bytes  # SHA-256 of its payload
+
+
+class Verdict(StrEnum):
+    """What is to become of it; the value is the name it is counted under."""
+
+    FIRST = "applied"  # none of its number is in the map
+    DUPLICATE = "duplicate"  # it is in the map
+    LATE = "late_duplicate"  # the horizon was passed since: the first stays, unseen
+    LOSES = "conflict"  # the other has the smaller hash
+    WINS = "replaced"  # the other has to go
+
+
+class Recent:
+    """Numbers and hashes of a source's last scans, up to HORIZON; the oldest is overwritten."""
+
+    def __init__(self) -> None:
+        self.numbers = np.zeros((FIRST_ROWS, 2), np.uint64)  # epoch, sequence
+        self.digests = np.zeros((FIRST_ROWS, HASH_BYTES), np.uint8)
+        self.is_placed = np.zeros(FIRST_ROWS, np.bool_)  # in the map; else it waits, or was refused
+        self.num = 0  # that ever came
+        self._last: tuple[int, int] | None = None
+
+    def add(self, epoch: int, sequence: int, digest: bytes) -> None:
+        if self.num == len(self.numbers) < HORIZON:
+            self.grow()
+        row = self.num % len(self.numbers)
+        self.numbers[row] = epoch, sequence
+        self.digests[row] = np.frombuffer(digest, np.uint8)
+        self.is_placed[row] = False
+        self.num += 1
+        self._last = epoch, sequence
+
+    def grow(self) -> None:
+        """Room for twice as many."""
+        self.numbers = np.concatenate([self.numbers, np.zeros_like(self.numbers)])
+        self.digests = np.concatenate([self.digests, np.zeros_like(self.digests)])
+        self.is_placed = np.concatenate([self.is_placed, np.zeros_like(self.is_placed)])
+
+    def find(self, epoch: int, sequence: int) -> int | None:
+        """Its row; None: it is not known any more."""
+        num = min(self.num, len(self.numbers))
+        if self._last == (epoch, sequence):
+            return (self.num - 1) % len(self.numbers)
+        same = self.numbers[:num] == np.array((epoch, sequence), np.uint64)
+        rows = np.flatnonzero(same[:, 1] & same[:, 0])
+        return int(rows[0]) if len(rows) else None
+
+    def columns(self) -> tuple[NDArray[np.uint64], NDArray[np.uint8], NDArray[np.bool_]]:
+        """(N, 2) numbers, (N, 32) hashes, (N,) whether placed; oldest first."""
+        order = np.arange(max(0, self.num - len(self.numbers)), self.num) % len(self.numbers)
+        return self.numbers[order], self.digests[order], self.is_placed[order]
+
+    @staticmethod
+    def of(
+        numbers: NDArray[np.uint64], digests: NDArray[np.uint8], is_placed: NDArray[np.bool_]
+    ) -> Recent:
+        """What `columns` gave."""
+        recent = Recent()
+        recent.num = len(numbers)
+        while len(recent.numbers) < recent.num:
+            recent.grow()
+        recent.numbers[: recent.num] = numbers
+        recent.digests[: recent.num] = digests
+        recent.is_placed[: recent.num] = is_placed
+        return recent
+
+
+class Rivals:
+    """Knows, for the last HORIZON scans of each source, which payload has their number.
+
+    What may not be forgotten is kept for good, and bounded: of which numbers not the first scan of
+    the log is in the map, and which are not in it at all.
+    """
+
+    def __init__(self, past: Past, *, window_bytes: int = WINDOW_BYTES) -> None:
+        self._past, self._window_bytes = past, window_bytes
+        self._recent: OrderedDict[str, Recent] = OrderedDict()  # the last heard of is the last
+        self._window: OrderedDict[Number, Envelope] = OrderedDict()
+        self._num_bytes = 0
+        self._chosen: dict[Number, bytes] = {}
+        self._refused: dict[tuple[str, int], Numbers] = {}
+
+    def claim(self, envelope: Envelope, source: str) -> Claim | None:
+        """What it claims; None for one whose number does not count."""
+        if not envelope.sequence or is_loose(envelope):
+            return None
+        if max(envelope.epoch, envelope.sequence) >= 1 << 64:  # a log from elsewhere may say so
+            return None
+        number = Number(source, envelope.epoch, envelope.sequence)
+        return Claim(number, hashlib.sha256(envelope.payload).digest())
+
+    def meet(self, claim: Claim, *, is_first: bool) -> Verdict:
+        """It has come; `is_first`: none with its number had. FIRST and WINS go on to `judge`."""
+        number, digest = claim
+        if not is_first:
+            row = self._row(number)
+            if row is None:
+                return Verdict.LATE
+            is_same = self._recent[number.source].digests[row].tobytes() == digest
+            return Verdict.DUPLICATE if is_same else Verdict.WINS
+        self._add(number, digest)
+        return Verdict.FIRST
+
+    def judge(self, claim: Claim) -> Verdict:
+        """It could be in the map now: whether it is to be."""
+        number, digest = claim
+        row = self._row(number)
+        if row is None:
+            return Verdict.LATE
+        recent = self._recent[number.source]
+        if not recent.is_placed[row]:
+            return Verdict.FIRST
+        kept = recent.digests[row].tobytes()
+        if kept == digest:
+            return Verdict.DUPLICATE
+        return Verdict.WINS if digest < kept else Verdict.LOSES
+
+    def kept(self, number: Number) -> bytes:
+        """The hash of the one that is in the map. Raises KeyError when that is not known."""
+        row = self._row(number)
+        if row is None:
+            raise KeyError(number)
+        return bytes(self._recent[number.source].digests[row])
+
+    def place(self, claim: Claim, envelope: Envelope) -> None:
+        """It is in the map now, and no other of its number. Raises ProtocolError, changing
+        nothing, when there is no room to remember it."""
+        number, digest = claim
+        row, recent = self._row(number), self._recent[number.source]
+        assert row is not None
+        if recent.digests[row].tobytes() != digest or self._is_refused(number):
+            self._choose(number, digest)
+        recent.digests[row] = np.frombuffer(digest, np.uint8)
+        recent.is_placed[row] = True
+        self._keep(number, envelope)
+
+    def refuse(self, number: Number) -> None:
+        """A good scan that is not in the map: no correction may take it out."""
+        name = (number.source, number.epoch)
+        self._refused.setdefault(name, Numbers()).add(number.sequence)
+
+    def in_map(self, number: Number) -> Envelope | None:
+        """The scan that is in the map, where it is not the first of the log with its number; None
+        where it is. Raises ProtocolError (unknown_scan) when none is, and as `find`."""
+        digest = self._chosen.get(number)
+        if digest is not None:
+            return self.find(number, digest)
+        if self._is_refused(number):
+            text = f"{number.source}: scan {number.sequence} is not in the map"
+            raise ProtocolError(text, "unknown_scan")
+        return None
+
+    def find(self, number: Number, digest: bytes) -> Envelope:
+        """The scan with that payload. Raises OSError, and ProtocolError when the log lacks it."""
+        near = self._window.get(number)
+        candidates = [near] if near is not None else []
+        if not any(_digest(e) == digest for e in candidates):
+            candidates = self._past.read([number]).get(number, [])
+        for envelope in candidates:
+            if _digest(envelope) == digest:
+                return envelope
+        text = f"{number.source}: scan {number.sequence} is not found in the log"
+        raise ProtocolError(text, "unreadable_log")
+
+    def freeze(self) -> dict[str, NDArray[Any]]:
+        """All but the window, which the log holds."""
+        columns = [recent.columns() for recent in self._recent.values()]
+        names = [[s, len(c[0])] for s, c in zip(self._recent, columns, strict=True)]
+        text = {
+            "sources": names,
+            "chosen": [[*number, digest.hex()] for number, digest in self._chosen.items()],
+            "refused": [[*name, n.starts, n.ends] for name, n in self._refused.items()],
+        }
+        none = Recent().columns()
+        numbers, digests, is_placed = (
+            np.concatenate(column) for column in zip(none, *columns, strict=True)
+        )
+        return {
+            "rivals": np.frombuffer(json.dumps(text).encode(), np.uint8),
+            "rival_numbers": numbers,
+            "rival_digests": digests,
+            "rival_placed": is_placed,
+        }
+
+    def thaw(self, frozen: Mapping[str, NDArray[Any]]) -> None:
+        """Know what was frozen. Raises KeyError, TypeError, ValueError for anything else."""
+        text = json.loads(frozen["rivals"].tobytes())
+        columns = [frozen[f"rival_{name}"] for name in ("numbers", "digests", "placed")]
+        num = sum(n for _, n in text["sources"])
+        if [c.shape for c in columns] != [(num, 2), (num, HASH_BYTES), (num,)]:
+            raise ValueError(f"{num} scans in {[c.shape for c in columns]}")
+        at = 0
+        for source, n in text["sources"]:
+            self._recent[str(source)] = Recent.of(*(c[at : at + n] for c in columns))
+            at += n
+        for source, epoch, sequence, digest in text["chosen"]:
+            self._chosen[Number(str(source), int(epoch), int(sequence))] = bytes.fromhex(digest)
+        for source, epoch, starts, ends in text["refused"]:
+            numbers = Numbers(list(map(int, starts)), list(map(int, ends)))
+            self._refused[str(source), int(epoch)] = numbers
+
+    def _is_refused(self, number: Number) -> bool:
+        return number.sequence in self._refused.get((number.source, number.epoch), ())
+
+    def _row(self, number: Number) -> int | None:
+        recent = self._recent.get(number.source)
+        return recent.find(number.epoch, number.sequence) if recent is not None else None
+
+    def _add(self, number: Number, digest: bytes) -> None:
+        if number.source not in self._recent:
+            if len(self._recent) >= MAX_SOURCES:
+                self._recent.popitem(last=False)
+            self._recent[number.source] = Recent()
+        self._recent.move_to_end(number.source)
+        self._recent[number.source].add(number.epoch, number.sequence, digest)
+
+    def _choose(self, number: Number, digest: bytes) -> None:
+        if number not in self._chosen and len(self._chosen) >= MAX_CHOSEN:
+            raise ProtocolError(f"{number.source}: no room for more", "too_many_conflicts")
+        self._chosen[number] = digest
+
+    def _keep(self, number: Number, envelope: Envelope) -> None:
+        """In the window: as bytes of its own, for a view would keep a whole chunk."""
+        old = self._window.pop(number, None)
+        self._num_bytes += len(envelope.payload) - (len(old.payload) if old is not None else 0)
+        self._window[number] = replace(envelope, payload=bytes(envelope.payload))
+        while self._num_bytes > self._window_bytes:
+            self._num_bytes -= len(self._window.popitem(last=False)[1].payload)
+
+
+def _digest(envelope: Envelope) -> bytes:
+    return hashlib.sha256(envelope.payload).digest()
