@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import time
 from dataclasses import replace
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ import pytest
 from facet.mapping.digest import state_digest
 from facet.mapping.mapper import Mapper
 from facet_protocol.messages import Plane, Pose, Scan
-from mapping_logs import log, mapped
+from mapping_logs import cloud, log, mapped
 from test_commands import Running
 
 LARGE = 5000  # points: a plane of fewer moves with every point that changes sides
@@ -50,11 +51,29 @@ MOTIONS = {
 }
 
 
+def farthest(large: list[Plane], after: tuple[Plane, ...], motion: Pose) -> tuple[float, float]:
+    """(rad, m): how far the worst of these planes turned and moved from where the motion puts it,
+    at its centroid."""
+    turns, offsets = [], []
+    for plane in large:
+        normal = motion.rotation() @ oriented(plane)[0]
+        centroid = motion.rotation() @ plane.centroid + motion.position
+        distances = []
+        for other in after:
+            n, d = oriented(other)
+            distances.append((float(np.linalg.norm(n - normal)), abs(float(n @ centroid) - d)))
+        turn, offset = min(distances)
+        turns.append(turn)
+        offsets.append(offset)
+    return max(turns), max(offsets)
+
+
 @pytest.mark.parametrize("name", MOTIONS)
-def test_p12_the_map_moves_with_the_robots(name: str) -> None:
-    """Other voxels hold the same points: about one in a hundred changes sides, and no large plane
-    moves by more than 1 mm or 5e-4 rad, a fifth of the noise. By whole tiles nothing changes at
-    all (test_exactness)."""
+def test_p12_a_small_noisy_map_moves_with_the_robots(name: str) -> None:
+    """Other voxels hold the same points: about one in a hundred changes sides. In a small room of
+    a tenth of the points the promised figures are below what the points know: no large plane moves
+    by more than 1 mm or 5e-4 rad, a fifth of the noise. By whole tiles nothing changes at all
+    (test_exactness)."""
     quaternion, shift = (np.array(v) for v in MOTIONS[name])
     motion = Pose(shift, quaternion / np.linalg.norm(quaternion))
     whole = log("room-lidar3d")
@@ -62,16 +81,42 @@ def test_p12_the_map_moves_with_the_robots(name: str) -> None:
     after = mapped([moved(s, motion) for s in whole.scans], whole.settings).snapshot().changed
     large = [plane for plane in before if plane.num_points >= LARGE]
     assert len(large) >= 5
-    for plane in large:
-        normal = motion.rotation() @ oriented(plane)[0]
-        centroid = motion.rotation() @ plane.centroid + shift
-        distances = []
-        for other in after:
-            n, d = oriented(other)
-            distances.append((float(np.linalg.norm(n - normal)), abs(float(n @ centroid) - d)))
-        turn, offset = min(distances)
-        assert turn < 5e-4, f"plane {plane.id} turned by {turn:.1e} rad"
-        assert offset < 1e-3, f"plane {plane.id} moved by {offset * 1e3:.2f} mm"
+    turn, offset = farthest(large, after, motion)
+    assert turn < 5e-4
+    assert offset < 1e-3
+
+
+def wide_room() -> list[Scan]:
+    """10 x 8 x 3 m, 300,000 points with 5 mm of noise, evenly on six faces, from four places."""
+    rng, size = np.random.default_rng(1), np.array([10.0, 8.0, 3.0])
+    area = size.prod() / size  # of a face, by the axis across it
+    faces = []
+    for axis, at in product(range(3), (0.0, 1.0)):
+        points = size * rng.random((int(150_000 * area[axis] / area.sum()), 3))
+        points[:, axis] = at * size[axis] + rng.normal(0.0, 0.005, len(points))
+        faces.append(points)
+    points = rng.permutation(np.concatenate(faces))
+    places = [(x, y, 1.4) for x in (3.0, 7.0) for y in (2.4, 5.6)]
+    return [
+        cloud(part, at=place, sequence=k)
+        for k, (part, place) in enumerate(zip(np.array_split(points, 4), places, strict=True), 1)
+    ]
+
+
+def test_p12_a_wide_room_moves_within_a_fifth_of_a_millimetre() -> None:
+    """By any rigid motion, as promised: 0.2 mm and 1e-4 rad. The conditions: three points a voxel,
+    noise of a tenth of a voxel, faces of 24 m2 and more."""
+    scans, rng = wide_room(), np.random.default_rng(3)
+    before = mapped(scans).snapshot().changed
+    assert sorted(p.plane_class.name for p in before) == ["CEILING", "FLOOR"] + ["WALL"] * 4
+    for _ in range(4):
+        quaternion = rng.normal(size=4)
+        motion = Pose(rng.uniform(-5.0, 5.0, 3), quaternion / np.linalg.norm(quaternion))
+        after = mapped([moved(s, motion) for s in scans]).snapshot().changed
+        assert len(after) == 6
+        turn, offset = farthest(list(before), after, motion)
+        assert turn <= 1e-4
+        assert offset <= 2e-4
 
 
 def state(mapper: Mapper) -> str:

@@ -6,9 +6,11 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from facet_protocol.projection import (
+    KEPT_BEAMS,
     MAX_ANGLE,
     count_ignored,
     fan_angles,
+    fan_directions,
     project_fan,
     sin_cos,
 )
@@ -82,3 +84,12 @@ def test_no_beams_give_no_points() -> None:
 def test_a_range_beyond_float32_is_infinite_and_quiet() -> None:
     points, _ = project_fan(0.5, 0.5, [1e300], reach_m=8.0)
     assert np.isinf(points[0, :2]).all()
+
+
+@pytest.mark.parametrize("num", [0, 1, 361, KEPT_BEAMS, KEPT_BEAMS + 1])
+def test_directions_that_are_kept_are_the_same(num: int) -> None:
+    told = sin_cos(fan_angles(-2.0, 2.5, num))
+    for _ in range(2):
+        for one, other in zip(fan_directions(-2.0, 2.5, num), told, strict=True):
+            assert one.tobytes() == other.tobytes()
+            assert num > KEPT_BEAMS or not one.flags.writeable

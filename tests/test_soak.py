@@ -5,12 +5,13 @@ from __future__ import annotations
 
 import gc
 import itertools
+import logging
 import os
 import shutil
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +21,7 @@ import psutil
 import pytest
 from foxglove_schemas_protobuf.LaserScan_pb2 import LaserScan
 
-from facet.sources.naming import is_scan
+from facet.sources.naming import is_scan, source_of
 from facet.sources.recording import Recording
 from facet_protocol.messages import Envelope
 from facet_protocol.topics import scan_key
@@ -28,7 +29,7 @@ from fault_rig import Line
 from rig import START_NS
 
 LAP = Path(__file__).parents[1] / "recordings" / "office-pushbroom.mcap"
-ROBOTS, RATE_HZ, BATCH = 10, 40, 400
+ROBOTS, RATE_HZ = 10, 40
 FILE_BYTES = 32 << 20  # a file's index is kept until it is finished: files that are soon full
 PROCESS = psutil.Process()
 
@@ -43,8 +44,9 @@ def lap() -> list[bytes]:
     return payloads
 
 
-def drives(payloads: list[bytes]) -> Iterator[list[Envelope]]:
-    """Batches of what ten robots send, each a tenth of a lap behind the one before, for ever."""
+def drives(payloads: list[bytes], seconds: int) -> Iterator[list[Envelope]]:
+    """What ten robots send in so many seconds of their driving, each a tenth of a lap behind the
+    one before, for ever."""
     behind = len(payloads) // ROBOTS
     batch: list[Envelope] = []
     for step in itertools.count():
@@ -57,9 +59,23 @@ def drives(payloads: list[bytes]) -> Iterator[list[Envelope]]:
                     key, "foxglove.LaserScan", "protobuf", payload, stamp_ns, 5, step + 1, stamp_ns
                 )
             )
-        if len(batch) >= BATCH:
+        if len(batch) >= seconds * ROBOTS * RATE_HZ:
             yield batch
             batch = []
+
+
+class Fleet(Line):
+    """A line that asks for its balance once a batch: what it has counted grows with the robots, and
+    adding it up after each scan takes longer than the scan."""
+
+    def take(self, envelopes: Iterable[Envelope]) -> Line:
+        for envelope in envelopes:
+            self._recorder.write(envelope)
+            self.account.arrive(source_of(envelope))
+            self._pipeline.insert(envelope)
+        self._recorder.commit()
+        assert self.account.balance().is_exact
+        return self
 
 
 @dataclass(frozen=True)
@@ -91,12 +107,17 @@ def open_files() -> Iterator[str]:
 
 
 def soak(
-    folder: Path, robot_hours: float, payloads: list[bytes], laps_between: float = 0.5
+    folder: Path,
+    robot_hours: float,
+    payloads: list[bytes],
+    laps_between: float = 0.5,
+    seconds_between: int = 1,
 ) -> list[Mark]:
-    """Drive; a mark every half lap after the first, at the same places of the floor."""
-    line, marks, num = Line(folder, FILE_BYTES), list[Mark](), 0
+    """Drive, with an update every few seconds of it; after the first lap a mark at every half lap,
+    at the same places of the floor."""
+    line, marks, num = Fleet(folder, FILE_BYTES), list[Mark](), 0
     every = int(laps_between * len(payloads)) * ROBOTS
-    for batch in drives(payloads):
+    for batch in drives(payloads, seconds_between):
         line.take(batch)
         line.update()
         num += len(batch)
@@ -133,14 +154,21 @@ def test_g10_a_few_laps(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_g10_four_robot_hours(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    started = time.monotonic()
-    marks = soak(tmp_path, 4.0, lap(), laps_between=2.0)
-    wall_s = time.monotonic() - started
+def test_g10_four_robot_hours(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """In four minutes: of processor time, all threads together, which others' work on the machine
+    stretches less than the clock's."""
+    caplog.set_level(logging.CRITICAL)  # what is said is kept for the report, and looks like a leak
+    started, spent = time.monotonic(), time.process_time()
+    marks = soak(tmp_path, 4.0, lap(), laps_between=1.0, seconds_between=3)
+    wall_s, processor_s = time.monotonic() - started, time.process_time() - spent
     with capsys.disabled():
         said = f"{marks[-1].robot_hours:.2f} robot-hours in {wall_s:.0f} s"
+        said += f" ({processor_s:.0f} s of the processor)"
         figures = f"{slope(marks):+.3f} MiB a robot-hour, {marks[-1].rss_mib:.0f} MiB"
         sys.stdout.write(f"\nG10: {said}, {figures}\n")
     checks(marks)
     assert slope(marks) <= 0.1
+    assert processor_s <= 240.0
     shutil.rmtree(tmp_path)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -27,6 +29,8 @@ _COS = (
     2.08757232129817482790e-09,
     -1.13596475577881948265e-11,
 )
+
+KEPT_BEAMS = 4096  # directions of larger fans are not kept
 
 MAX_ANGLE = 1000.0  # rad; what sin_cos is accurate for, and more than any scanner turns
 
@@ -62,6 +66,20 @@ def fan_angles(start_angle: float, end_angle: float, num: int) -> Floats:
     return start_angle + np.arange(num, dtype=np.float64) * step
 
 
+def fan_directions(start_angle: float, end_angle: float, num: int) -> tuple[Floats, Floats]:
+    """Sine and cosine (num,) of `fan_angles`. A scanner's fans are all alike: they are kept."""
+    if num <= KEPT_BEAMS:
+        return _kept_directions(start_angle, end_angle, num)
+    return sin_cos(fan_angles(start_angle, end_angle, num))
+
+
+@lru_cache(maxsize=16)
+def _kept_directions(start_angle: float, end_angle: float, num: int) -> tuple[Floats, Floats]:
+    sine, cosine = sin_cos(fan_angles(start_angle, end_angle, num))
+    sine.flags.writeable = cosine.flags.writeable = False
+    return sine, cosine
+
+
 def project_fan(
     start_angle: float, end_angle: float, ranges: ArrayLike, reach_m: float
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -71,7 +89,7 @@ def project_fan(
     empty and is free as far as `reach_m`; NaN and ranges <= 0 say nothing (see `count_ignored`).
     """
     r = np.asarray(ranges, dtype=np.float64)
-    sine, cosine = sin_cos(fan_angles(start_angle, end_angle, r.size))
+    sine, cosine = fan_directions(start_angle, end_angle, r.size)
     hit = (r > 0.0) & (r < np.inf)
     empty = r == np.inf
     return (

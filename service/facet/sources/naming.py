@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from functools import lru_cache
 
 from facet_protocol import topics
 from facet_protocol.messages import Envelope, ProtocolError
@@ -17,6 +18,7 @@ POSE_SCHEMAS = (*ROS_POSES, "foxglove.PoseInFrame")  # of what, only a rule or t
 _DOMAIN = re.compile(r"/(\d+)/")
 
 
+@lru_cache(maxsize=1024)  # asked several times for each message, of few keys
 def robot_and_sensor(key: str) -> tuple[str, str]:
     """(robot, sensor) of an input's key; of a topic from elsewhere, names made of the topic."""
     try:
