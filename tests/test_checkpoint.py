@@ -129,6 +129,9 @@ def forged(header: bytes, body: bytes = b"", version: int = FORMAT) -> bytes:
         (forged(b'{"arrays": [["a", "<i8", [1], 8]]}', bytes(64)), "no sense"),
         (forged(b'{"arrays": [["a", "<i8", [99999999999, 99999999999], 0]]}'), "no sense"),
         (forged(b'{"arrays": [["a", "<i8", ["1"], 0]]}', bytes(64)), "no sense"),
+        (forged(b'{"arrays": [["a", "<a4", [1], 0]]}', bytes(64)), "no sense"),
+        (forged(b'{"arrays": [["a", "<i8,<i8", [1], 0]]}', bytes(64)), "no sense"),
+        (forged(b'{"arrays": ' + b"[" * 100_000), "no sense"),
     ],
 )
 def test_what_makes_no_sense_is_refused(tmp_path: Path, data: bytes, reason: str) -> None:

@@ -10,7 +10,9 @@ import logging
 import os
 import random
 import resource
+import struct
 import time
+import zlib
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -39,6 +41,7 @@ from test_checkpoint import sample
 
 SECONDS = float(os.environ.get("FACET_FUZZ_S", "2"))
 SOAK_S = 60.0
+PREAMBLE = struct.Struct("<8sIIIIQ")  # of a checkpoint
 SEED = int(os.environ.get("FACET_FUZZ_SEED", "0")) or time.time_ns() % 2**32
 NUMBERS = (0, 1, 0x7F, 0x80, 0xFF, 0xFFFF, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, 2**63, 2**64 - 1)
 
@@ -158,7 +161,18 @@ def log_reader(folder: Path) -> Target:
     return Target(corpus, feed, (LogError,))
 
 
+def sealed(data: bytes) -> bytes:
+    """A checkpoint's checksums made right again: what they guard is read."""
+    if len(data) < PREAMBLE.size:
+        return data
+    magic, version, size, _, _, length = PREAMBLE.unpack_from(data)
+    text, rest = data[PREAMBLE.size :][:size], data[PREAMBLE.size + size :]
+    sums = (zlib.crc32(text), zlib.crc32(rest))
+    return PREAMBLE.pack(magic, version, size, *sums, length) + text + rest
+
+
 def checkpoint(folder: Path) -> Target:
+    """As damaged, and as forged: with checksums that are right."""
     path, previous = folder / "a", folder / "b"
     corpus = []
     for number in (1, 2):
@@ -166,6 +180,9 @@ def checkpoint(folder: Path) -> Target:
         corpus.append(path.read_bytes())
 
     def feed(data: bytes) -> Checkpoint:
+        path.write_bytes(sealed(data))
+        with suppress(CheckpointError):
+            read_checkpoint(path)
         path.write_bytes(data)
         return read_checkpoint(path)
 

@@ -15,6 +15,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import struct
 import zlib
 from collections.abc import Mapping
@@ -33,6 +34,7 @@ ALIGNMENT = 64
 MAX_HEADER_BYTES = 64 << 20
 _PREAMBLE = struct.Struct("<8sIIIIQ")
 _KINDS = "biufSU"  # of dtypes: plain numbers and fixed strings
+_DTYPE = re.compile(rf"[<|][{_KINDS}][0-9]{{1,4}}")  # as numpy spells them: it reads much more
 _PIECE = 4 << 20  # on the disk at a time: a log on the same disk does not wait for all of it
 
 Arrays = Mapping[str, NDArray[Any]]
@@ -157,16 +159,16 @@ def read_checkpoint(path: Path) -> Checkpoint:
     try:
         header = json.loads(text)
         arrays = {str(row[0]): _array(body, *row[1:]) for row in header.pop("arrays")}
-    except (ValueError, TypeError, KeyError, AttributeError, IndexError) as error:
+    except (ValueError, TypeError, LookupError, AttributeError, RecursionError) as error:
         raise CheckpointError(path, f"its header makes no sense ({error})") from error
     return Checkpoint(header, arrays)
 
 
 def _array(body: NDArray[np.uint8], dtype: str, shape: list[int], at: int) -> NDArray[Any]:
     """One array of the table. Raises ValueError, TypeError where it cannot be."""
-    kind = np.dtype(dtype)
-    if kind.kind not in _KINDS or any(n < 0 for n in shape) or at < 0 or at % ALIGNMENT:
+    if _DTYPE.fullmatch(dtype) is None or any(n < 0 for n in shape) or at < 0 or at % ALIGNMENT:
         raise ValueError(f"an array of {dtype} {shape} at {at}")
+    kind = np.dtype(dtype)
     num_bytes = math.prod(shape) * kind.itemsize
     if at + num_bytes > len(body):
         raise ValueError(f"an array of {dtype} {shape} at {at} in {len(body)} bytes")
