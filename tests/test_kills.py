@@ -92,14 +92,17 @@ class Victim:
         time.sleep(seconds)
 
     def lines(self) -> Iterator[str]:
-        """What is acknowledged, as it is."""
+        """What is acknowledged, as it is, to the end."""
         assert self._process.stdout is not None
-        yield from self._process.stdout
+        with self._process.stdout as stdout:
+            yield from stdout
 
     def end(self) -> None:
         """Kill it, whoever reads what it says."""
         self._process.kill()
         self._process.wait()
+        assert self._process.stderr is not None
+        self._process.stderr.close()
 
     def kill(self) -> list[Name]:
         self._process.kill()

@@ -1,15 +1,19 @@
 """The log and what is kept of the map beside it: acknowledgements, checkpoints, resumes.
 
 Acknowledgement: from a robot's `put` in this process, over Zenoh on loopback, to the line by which
-the service in another says that the message is durable; ten robots at 40 Hz. A checkpoint of a
-million voxels is held and written while another thread records 400 messages a second: how much
-later they are acknowledged by that. A resume: that checkpoint, and the log of six seconds after it.
+the service in another says that the message is durable; ten robots at 40 Hz. What fdatasync takes
+beside it, in a thread of this process on the same disk, says how much of that is the disk's.
+
+A checkpoint of a million voxels is held and written while another thread records 400 messages a
+second: how much later they are acknowledged by that. A resume: that checkpoint, and the log of six
+seconds after it.
 """
 
 from __future__ import annotations
 
 import json
 import logging
+import os
 import sys
 import tempfile
 import threading
@@ -29,18 +33,15 @@ from facet.resume import hold, note_newest, resume, save
 from facet.robots import admission_of
 from facet.sinks.recorder import Recorder
 from facet.status import Account
-from facet_protocol.messages import Envelope, Pose, Scan, ScanKind
+from facet_protocol.messages import Pose, Scan, ScanKind
 from rig import room_scan
-from test_kills import NUM_ROBOTS, RATE_HZ, Robots, Victim, small_scans
+from test_acknowledged import MESSAGE_S, acknowledged
+from test_kills import NUM_ROBOTS, small_scans
 
 SIDE_M = 10.0  # of the floor that one scan covers
 POINTS = 200_000  # of such a scan: five a voxel
-MESSAGE_S = 1.0 / (NUM_ROBOTS * RATE_HZ)
 COMMIT_S = 0.05
-WARM_S = 3.0  # kernels are loaded
 TAIL_SCANS = 2400  # six seconds of ten robots at 40 Hz: as 60 s are to ten million voxels
-
-Latencies = NDArray[np.float64]  # ms
 
 
 def hall(num_tiles: int) -> list[Scan]:
@@ -70,52 +71,6 @@ def recorder_of(folder: Path, mapper: Mapper) -> Recorder:
     settings = json.dumps(mapper.settings.as_dict())
     metadata = {"cuts": "logged", "resolved": "logged", "map": "map", "settings": settings}
     return Recorder(folder, "map", metadata, clock=time.time_ns)
-
-
-def acknowledged(num_s: float) -> Latencies:
-    """Of every message of ten robots, over Zenoh, until it is durable."""
-    sent: list[float] = []
-
-    with tempfile.TemporaryDirectory() as name:
-        victim = Victim(Path(name) / "log", checkpoint_s=10.0)
-        robots = Robots(victim.endpoint, _Noted(small_scans(40), sent))
-        times: dict[tuple[int, int], float] = {}
-        reader = threading.Thread(target=_read, args=(victim, times), daemon=True)
-        reader.start()
-        robots.start()
-        time.sleep(num_s)
-        robots.stopping.set()
-        robots.join(10.0)
-        time.sleep(0.5)
-        victim.end()
-        reader.join(5.0)
-    latencies = [
-        (times[n % NUM_ROBOTS, n // NUM_ROBOTS + 1] - at) * 1e3
-        for n, at in enumerate(sent)
-        if (n % NUM_ROBOTS, n // NUM_ROBOTS + 1) in times
-    ]
-    lost = len(sent) - len(latencies)
-    assert lost <= 1, f"{lost} messages were not acknowledged"
-    return np.array(latencies[int(WARM_S / MESSAGE_S) :])
-
-
-class _Noted(list[Envelope]):
-    """Scans, each of which notes when it is taken."""
-
-    def __init__(self, scans: list[Envelope], sent: list[float]) -> None:
-        super().__init__(scans)
-        self._sent = sent
-
-    def __getitem__(self, index: Any) -> Any:
-        self._sent.append(time.perf_counter())
-        return super().__getitem__(index)
-
-
-def _read(victim: Victim, times: dict[tuple[int, int], float]) -> None:
-    for line in victim.lines():
-        key, _epoch, sequence = line.split()
-        robot = int(key.split("/robot/r")[1].split("/")[0])
-        times[robot, int(sequence)] = time.perf_counter()
 
 
 class Recording400(threading.Thread):
@@ -208,7 +163,8 @@ def with_tail(folder: Path, mapper: Mapper) -> None:
 
 
 def main(quick: bool) -> None:
-    latencies = acknowledged(6.0 if quick else 30.0)
+    with tempfile.TemporaryDirectory() as name:
+        latencies, disk = acknowledged(Path(name), 6.0 if quick else 30.0)
     mapper = Mapper(MapSettings())
     for scan in hall(2 if quick else 15):
         mapper.insert(scan)
@@ -225,6 +181,8 @@ def main(quick: bool) -> None:
         at_most("acknowledged, p50 (G9)", float(np.percentile(latencies, 50)), 100.0, "ms"),
         at_most("acknowledged, p99", float(np.percentile(latencies, 99)), 150.0, "ms"),
         at_most("acknowledged, max", float(latencies.max()), 500.0, "ms"),
+        Figure("what the disk took by itself meanwhile, p50, p99, max", _three(disk), "ms"),
+        Figure("processes that wanted the cores (load of a minute)", os.getloadavg()[0]),
         at_least("voxels of the map", voxels, 0 if quick else 1_000_000),
         at_most("checkpoint held by the mapper's thread (G8)", cost["hold_ms"], 50.0, "ms"),
         Figure("the first one, in memory that is new", cost["first_hold_ms"], "ms"),
@@ -236,6 +194,10 @@ def main(quick: bool) -> None:
         at_most("resume: and 6 s of ten robots at 40 Hz", tail_s, 3.0, "s"),
     ]
     report("recorder", "The log, checkpoints, resumes", figures, cost)
+
+
+def _three(ms: NDArray[np.float64]) -> str:
+    return f"{np.median(ms):.1f}, {np.percentile(ms, 99):.1f}, {ms.max():.1f}"
 
 
 def _pair(cost: dict[str, Any], what: str) -> str:
