@@ -118,6 +118,7 @@ def test_empty_beams_of_a_cloud() -> None:
     ("other", "text"),
     [
         ({"point_step": 0}, "width 12 x point_step 0"),
+        ({"width": 0, "point_step": 2**32 - 1}, "point_step 4294967295 is more than the 144"),
         ({"row_step": 143}, "row_step 143 is less than width 12 x point_step 12"),
         ({"row_step": 145}, "144 bytes, height 1 x row_step 145"),
         ({"height": 2}, "144 bytes, height 2 x row_step 144"),

@@ -105,6 +105,8 @@ def _check_shape(shape: _Shape, num_bytes: int) -> None:
         return
     if point_step == 0 or row_step < width * point_step:
         raise _refuse(f"row_step {row_step} is less than width {width} x point_step {point_step}")
+    if point_step > num_bytes:  # of rows without a point, too
+        raise _refuse(f"point_step {point_step} is more than the {num_bytes} bytes there are")
     if height * row_step != num_bytes:
         raise _refuse(f"{num_bytes} bytes, height {height} x row_step {row_step} says otherwise")
 
