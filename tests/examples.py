@@ -14,6 +14,7 @@ from facet_protocol.messages import (
     Correction,
     Cut,
     Envelope,
+    Erase,
     Event,
     EventKind,
     Events,
@@ -141,6 +142,7 @@ EXAMPLES: dict[str, Message] = {
     "facet.v1.Conflict": Conflict(
         "r1", "front", 7, 42, STAMP_NS, bytes(32), bytes([255] * 32), True
     ),
+    "facet.v1.Erase": Erase("r1", "front", 7, 40, 42),
     "facet.v1.Loss": Loss("r1", "front", 7, 43, 5, "lost_upstream", STAMP_NS),
 }
 

@@ -59,6 +59,9 @@ LAYERS = {  # the longest name that fits counts
     ),
     "facet.simulate": Layer("facet.simulate.* facet_protocol.*", "numpy numba"),
     "facet.config": Layer("", "pydantic"),
+    "facet.erasing": Layer(
+        "facet.outgoing facet.sinks.* facet.sources.naming facet.status facet_protocol.*"
+    ),
     "facet.frames": Layer("facet_protocol.*", pure=True),
     "facet.past": Layer("facet.sinks.log_file facet.sources.* facet_protocol.*"),
     "facet.publishers": Layer("", pure=True),
@@ -74,7 +77,8 @@ LAYERS = {  # the longest name that fits counts
     "facet.resume": Layer(f"{WIRING.ours} facet.checkpoint facet.cuts"),
     "facet.keeper": Layer("facet.checkpoint facet.config facet.resume facet.status"),
     "facet.service": Layer(
-        f"{WIRING.ours} facet.checkpoint facet.export.* facet.keeper facet.resume", "numpy zenoh"
+        f"{WIRING.ours} facet.checkpoint facet.erasing facet.export.* facet.keeper facet.resume",
+        "numpy zenoh",
     ),
     "facet.commands": EVERYTHING,
     "facet.__main__": EVERYTHING,

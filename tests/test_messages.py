@@ -40,8 +40,8 @@ def test_public_names_are_pinned() -> None:
 
 PUBLIC = """
 Attachment attachment Conflict Corrected CorrectedPose Correction Cut decode decode_scan
-descriptor_set encode encode_scan encode_scene encode_tiles_cloud Envelope Event EventKind Events
-facet_descriptors Hole HoleKind LineFan Loss MapMirror MapUpdate Message Plane PlaneClass PlaneFrame
-Pose project project_fan ProtocolError ResolvedPose Scan ScanKind Schema SCHEMAS sin_cos StampedPose
-StampedTransform Status Surface TilePoints Tombstone topics Transforms
+descriptor_set encode encode_scan encode_scene encode_tiles_cloud Envelope Erase Event EventKind
+Events facet_descriptors Hole HoleKind LineFan Loss MapMirror MapUpdate Message Plane PlaneClass
+PlaneFrame Pose project project_fan ProtocolError ResolvedPose Scan ScanKind Schema SCHEMAS sin_cos
+StampedPose StampedTransform Status Surface TilePoints Tombstone topics Transforms
 """

@@ -24,6 +24,7 @@ from facet_protocol.messages import (
     Correction,
     Cut,
     Envelope,
+    Erase,
     Events,
     LineFan,
     Loss,
@@ -59,6 +60,7 @@ Message = (
     | Correction
     | Corrected
     | Conflict
+    | Erase
     | Loss
 )
 
@@ -127,6 +129,7 @@ SCHEMAS: dict[str, Schema] = {
     "facet.v1.Conflict": _row(
         Conflict, records.encode_conflict, records.decode_conflict, service_pb2.Conflict
     ),
+    "facet.v1.Erase": _row(Erase, records.encode_erase, records.decode_erase, service_pb2.Erase),
     "facet.v1.Loss": _row(Loss, records.encode_loss, records.decode_loss, service_pb2.Loss),
 }
 

@@ -196,6 +196,17 @@ class Conflict:
     replaced: bool  # the one that came last is kept: the other was taken out again
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class Erase:
+    """Take a robot's scans out of the map: those that came before, as if they never had."""
+
+    robot: str
+    sensor: str = ""  # "": each of its own
+    epoch: int = 0  # 0: every one
+    first: int = 0  # sequence
+    last: int = 0  # inclusive; 0: no end
+
+
 class PlaneClass(StrEnum):
     FLOOR = "floor"
     CEILING = "ceiling"

@@ -8,6 +8,7 @@ from facet_protocol.messages import (
     CorrectedPose,
     Correction,
     Cut,
+    Erase,
     Loss,
     Pose,
     ProtocolError,
@@ -139,6 +140,21 @@ def decode_conflict(payload: bytes | memoryview) -> Conflict:
     m = parse(pb.Conflict, payload)
     numbers = (m.epoch, m.sequence, m.stamp_ns)
     return Conflict(m.robot, m.sensor, *numbers, m.kept, m.left_out, m.replaced)
+
+
+def encode_erase(erase: Erase) -> bytes:
+    return pb.Erase(
+        robot=erase.robot,
+        sensor=erase.sensor,
+        epoch=erase.epoch,
+        first=erase.first,
+        last=erase.last,
+    ).SerializeToString(deterministic=True)
+
+
+def decode_erase(payload: bytes | memoryview) -> Erase:
+    m = parse(pb.Erase, payload)
+    return Erase(m.robot, m.sensor, m.epoch, m.first, m.last)
 
 
 def encode_loss(loss: Loss) -> bytes:

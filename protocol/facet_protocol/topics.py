@@ -14,6 +14,7 @@ CUT_TOPIC = "/facet/cut"
 RESOLVED_TOPIC = "/facet/resolved"
 CORRECTED_TOPIC = "/facet/corrected"
 CONFLICT_TOPIC = "/facet/conflict"
+_ERASE_TOPIC = "/facet/erase/"
 UPDATE_TOPIC = "/facet/update"
 EVENTS_TOPIC = "/facet/events"
 SCENE_TOPIC = "/facet/scene"
@@ -115,6 +116,22 @@ def parse_correction_key(key: str) -> tuple[str, str]:
     if match is None:
         raise ProtocolError(f"{key[:200]!r} is not the key of a correction", "bad_key")
     return check_id(match.group(1)), check_id(match.group(2))
+
+
+def erase_topic(robot: str) -> str:
+    """Where the log keeps what was erased of a robot: no key leads there, only the command."""
+    return f"{_ERASE_TOPIC}{check_id(robot)}"
+
+
+def is_erase_topic(topic: str) -> bool:
+    return topic.startswith(_ERASE_TOPIC)
+
+
+def parse_erase_topic(topic: str) -> str:
+    """The robot. Raises ProtocolError when it is not such a topic."""
+    if not is_erase_topic(topic):
+        raise ProtocolError(f"{topic[:200]!r} is not where erasures are kept", "bad_key")
+    return check_id(topic.removeprefix(_ERASE_TOPIC))
 
 
 def plane_key(map_id: str, plane_id: int) -> str:

@@ -58,11 +58,11 @@ WAIT_BYTES = 256 << 20  # of scans that wait
 
 
 class Moved(NamedTuple):
-    """Scans to be moved, all of them: as they are in the map, and as they are to be. None when the
-    correction was refused; `corrected` is what became of it."""
+    """Scans to be moved, all of them: as they are in the map, and as they are to be, or None: they
+    go. No scans when the correction was refused; `corrected` is what became of it."""
 
     envelope: Envelope
-    scans: tuple[tuple[Scan, Scan], ...]
+    scans: tuple[tuple[Scan, Scan | None], ...]
     corrected: Corrected
 
 

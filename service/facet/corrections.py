@@ -1,4 +1,4 @@
-"""New poses for scans that are in the map: a batch is applied whole or not at all. No clock.
+"""New poses for scans that are in the map, or none any more: all of a batch, or nothing. No clock.
 
 The points come from the log, which may take a while: a correction waits for them, and the map goes
 on. What became of it is written down (`/facet/corrected`), and a replay does the same at the same
@@ -11,6 +11,7 @@ from collections import defaultdict, deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, wait
 from dataclasses import dataclass, replace
+from itertools import islice
 from typing import NamedTuple
 
 from facet.firsts import Firsts, is_loose
@@ -24,14 +25,21 @@ from facet_protocol.messages import (
     CorrectedPose,
     Correction,
     Envelope,
+    Erase,
     Pose,
     ProtocolError,
     Scan,
 )
-from facet_protocol.topics import check_id, parse_correction_key
+from facet_protocol.topics import (
+    check_id,
+    is_erase_topic,
+    parse_correction_key,
+    parse_erase_topic,
+)
 
 SCHEMA = "facet.v1.Correction"
 MAX_HELD = 256  # corrections that wait for their points
+MAX_ERASED = 1 << 16  # scans, at once
 BOUND_M = 50_000.0  # no map reaches further
 Ask = Callable[[Sequence[Number]], "Future[Found]"]
 Decode = Callable[[Envelope], Scan]
@@ -43,7 +51,7 @@ class Held:
 
     envelope: Envelope
     numbers: list[Number]
-    poses: list[Pose]  # new ones, T_world_sensor
+    poses: list[Pose] | None  # new ones, T_world_sensor; None: they are to go
     found: Future[Found] | None = None  # asked for
 
 
@@ -52,7 +60,7 @@ class Settled(NamedTuple):
 
     envelope: Envelope
     corrected: Corrected
-    scans: tuple[tuple[Scan, Scan], ...] = ()
+    scans: tuple[tuple[Scan, Scan | None], ...] = ()
     error: ProtocolError | None = None
 
 
@@ -129,6 +137,8 @@ class Corrections:
 
     def _checked(self, envelope: Envelope) -> Held:
         """Raises ProtocolError where something is wrong with it that can be told at once."""
+        if is_erase_topic(envelope.key):
+            return self._erasure(envelope)
         _, named = parse_correction_key(envelope.key)
         is_one = envelope.schema == SCHEMA and envelope.encoding == "protobuf"
         correction = decode(envelope) if is_one else None
@@ -145,6 +155,20 @@ class Corrections:
             raise ProtocolError(f"{envelope.schema}: a scan is named twice", "repeated_scan")
         return Held(envelope, numbers, [pose.pose for pose in correction.poses])
 
+    def _erasure(self, envelope: Envelope) -> Held:
+        """Raises ProtocolError."""
+        erase = decode(envelope)
+        if not isinstance(erase, Erase) or erase.robot != parse_erase_topic(envelope.key):
+            raise ProtocolError(f"{envelope.schema[:80]!r} is no erasure", "unknown_schema")
+        found = islice(self._firsts.of(erase), MAX_ERASED + 1)
+        numbers = [Number(*number) for number in found]
+        if not numbers:
+            raise ProtocolError(f"no such scan of {erase.robot} has come", "unknown_scan")
+        if len(numbers) > MAX_ERASED:
+            text = f"{erase.robot}: more than {MAX_ERASED} scans at once: say first= and last="
+            raise ProtocolError(text, "too_large")
+        return Held(envelope, numbers, None)
+
     def _number(self, robot: str, corrected: CorrectedPose) -> Number:
         source = f"{robot}/{check_id(corrected.sensor)}"
         position = corrected.pose.position.tolist()
@@ -160,6 +184,8 @@ class Corrections:
         """Move all of its scans, or none."""
         try:
             found = question.result()
+            if held.poses is None:
+                return self._settle_erasure(held, found)
             old = [self.as_mapped(number, found.get(number, [])) for number in held.numbers]
             moved: defaultdict[Name, list[tuple[int, Pose]]] = defaultdict(list)
             for number, pose in zip(held.numbers, held.poses, strict=True):
@@ -173,6 +199,20 @@ class Corrections:
             return self._refused(held.envelope, ProtocolError(text, "unreadable_log"))
         pairs = zip(old, held.poses, strict=True)
         scans = tuple((scan, replace(scan, pose=pose)) for scan, pose in pairs)
+        return Settled(held.envelope, self._record(held.envelope, len(scans)), scans)
+
+    def _settle_erasure(self, held: Held, found: Found) -> Settled:
+        """Those of its scans that are in the map have to go. Raises ProtocolError, OSError."""
+        old: dict[Number, Scan] = {}
+        for number in held.numbers:
+            try:
+                old[number] = self.as_mapped(number, found.get(number, []))
+            except ProtocolError as error:
+                if error.reason != "unknown_scan":
+                    raise
+        for number in old:
+            self._rivals.erase(number)
+        scans = tuple((scan, None) for scan in old.values())
         return Settled(held.envelope, self._record(held.envelope, len(scans)), scans)
 
     def as_mapped(self, number: Number, candidates: Sequence[Envelope]) -> Scan:

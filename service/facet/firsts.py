@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from facet.sequences import SequenceLedger
-from facet_protocol.messages import Envelope
+from facet_protocol.messages import Envelope, Erase
 from facet_protocol.topics import PREFIX
 
 HASH_BYTES = 16
@@ -40,6 +40,16 @@ class Firsts:
         """The epoch in which the number has come; None: it has not. Of epoch 0, where the source
         has none such, the one it is in."""
         return self._numbers.find(source, epoch, sequence)
+
+    def of(self, erase: Erase) -> Iterator[tuple[str, int, int]]:
+        """(source, epoch, sequence) of all that has come of what an erasure names."""
+        last = erase.last or 1 << 64
+        for source in self._numbers.num_epochs():
+            robot, _, sensor = source.partition("/")
+            is_meant = robot == erase.robot and erase.sensor in ("", sensor)
+            if is_meant and not sensor.startswith("@"):
+                found = self._numbers.between(source, erase.epoch, erase.first, last)
+                yield from ((source, *numbers) for numbers in found)
 
     def freeze(self) -> dict[str, NDArray[Any]]:
         """What it remembers, for a checkpoint."""

@@ -18,7 +18,16 @@ from facet.sinks.recorder import LogPosition, Recorder
 from facet.sources.live import Inbox, loss_of
 from facet.sources.naming import source_of
 from facet.status import Account
-from facet_protocol.messages import Envelope, Events, Loss, MapUpdate, Scan, Status, TilePoints
+from facet_protocol.messages import (
+    Envelope,
+    Erase,
+    Events,
+    Loss,
+    MapUpdate,
+    Scan,
+    Status,
+    TilePoints,
+)
 
 logger = logging.getLogger(__name__)
 
@@ -215,6 +224,8 @@ class Intake:
                 self._awaited.append(taken)
                 continue
             self._recorder.write(taken[0])
+            if isinstance(taken[1], Erase):  # of our own making, and an input all the same
+                self._scans.append(taken[0])
             if isinstance(taken[1], MapUpdate | Events):
                 self._said.append(taken)
 

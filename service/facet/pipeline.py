@@ -122,11 +122,23 @@ class Pipeline:
     def _move(self, moved: Moved) -> None:
         """Scans from where they are to where they are to be."""
         for old, new in moved.scans:
+            if new is None:
+                self._erase(old)
+                continue
             points = self._exchange(old, new)
             self._account.settle(new.source, "scans_corrected", 0, {"scans_corrected": 1, **points})
         if moved.scans:
-            self._account.settle(source_of(moved.envelope), "used_as_correction")
+            is_erasure = topics.is_erase_topic(moved.envelope.key)
+            outcome = "used_as_erasure" if is_erasure else "used_as_correction"
+            self._account.settle(source_of(moved.envelope), outcome)
             self.is_stale = True
+
+    def _erase(self, scan: Scan) -> None:
+        """Take a scan out, exactly. It was applied; its points are none of the map's any more."""
+        num = len(quantise(scan, self._mapper.settings).points)
+        self._mapper.retract(scan)
+        points = {"points_stored": -num, "points_rejected.erased": num}
+        self._account.settle(scan.source, "scans_erased", 0, {"scans_erased": 1, **points})
 
     def _exchange(self, old: Scan, new: Scan) -> dict[str, int]:
         """Take one scan out and put another in, exactly; by how much the counters of points move.

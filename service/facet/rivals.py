@@ -173,6 +173,11 @@ class Rivals:
         name = (number.source, number.epoch)
         self._refused.setdefault(name, Numbers()).add(number.sequence)
 
+    def erase(self, number: Number) -> None:
+        """It was in the map, and no scan of its number is to be again."""
+        self._chosen.pop(number, None)
+        self.refuse(number)
+
     def in_map(self, number: Number) -> Envelope | None:
         """The scan that is in the map, where it is not the first of the log with its number; None
         where it is. Raises ProtocolError (unknown_scan) when none is, and as `find`."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from bisect import bisect_right
 from collections import Counter, defaultdict
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -101,6 +101,15 @@ class SequenceLedger:
         if not epoch and epoch not in epochs:
             epoch = self._current.get(source, 0)
         return epoch if epoch in epochs and sequence in epochs[epoch] else None
+
+    def between(self, source: str, epoch: int, first: int, last: int) -> Iterator[tuple[int, int]]:
+        """(epoch, sequence) of what has come from `first` to `last`; of epoch 0: of every one."""
+        for known, numbers in self._seen.get(source, {}).items():
+            if epoch and epoch != known:
+                continue
+            for start, end in zip(numbers.starts, numbers.ends, strict=True):
+                for sequence in range(max(start, first), min(end, last) + 1):
+                    yield known, sequence
 
     def freeze(self) -> dict[str, Any]:
         """All of it, as JSON knows it."""

@@ -20,6 +20,7 @@ from facet import __version__
 from facet.admission import Admission
 from facet.checkpoint import Checkpoint
 from facet.config import Config
+from facet.erasing import Erasing
 from facet.export.formats import FORMATS
 from facet.export.model import Model, build_model
 from facet.intake import DurableQueue, Intake
@@ -97,6 +98,7 @@ class Service:
             exit_on_failure=config.record.on_full == "exit",
             past=self._past,
         )
+        self._erasing = Erasing(self._intake, self._outgoing, self.account)
         self._position: LogPosition | None = None  # all before it in the log is in the map
         self._newest: Newest = {}
         self._tasks: SimpleQueue[Task] = SimpleQueue()
@@ -129,7 +131,7 @@ class Service:
             self._mapper,
             self._admission,
             self.account,
-            [self._intake],
+            [self._intake, self._erasing],
             self._outgoing,
             every_ns,
         )
@@ -290,7 +292,7 @@ class Service:
             "export": self._export,
             "record": self._record,
             "checkpoint": self._checkpoint,
-            "erase": _not_yet("a correction moves scans, nothing takes them out yet"),
+            "erase": self._erasing.ask,
         }
 
     def _pause(self, parameters: Mapping[str, str]) -> Mapping[str, Any]:
@@ -344,13 +346,6 @@ class Service:
             return task.result.result(timeout=ANSWER_S)
         except TimeoutError:
             raise CommandError("the mapper is busy: ask again") from None
-
-
-def _not_yet(cause: str) -> Callable[[Mapping[str, str]], Mapping[str, Any]]:
-    def refuse(parameters: Mapping[str, str]) -> Mapping[str, Any]:
-        raise CommandError(f"not supported: {cause}")
-
-    return refuse
 
 
 def _recorder(config: Config, mapper: Mapper) -> Recorder:

@@ -26,7 +26,7 @@ BURST_S = 10.0  # one line of log per source and reason in this time
 # no points, and said where a sensor is, or was.
 LEFT_OUT = (
     *("duplicate", "late_duplicate", "conflict", "shed_overload", "too_large", "unrecorded"),
-    *("not_applied", "used_as_pose", "used_as_correction"),
+    *("not_applied", "used_as_pose", "used_as_correction", "used_as_erasure"),
 )
 
 

@@ -106,6 +106,20 @@ class Conflict(_message.Message):
     replaced: bool
     def __init__(self, robot: _Optional[str] = ..., sensor: _Optional[str] = ..., epoch: _Optional[int] = ..., sequence: _Optional[int] = ..., stamp_ns: _Optional[int] = ..., kept: _Optional[bytes] = ..., left_out: _Optional[bytes] = ..., replaced: _Optional[bool] = ...) -> None: ...
 
+class Erase(_message.Message):
+    __slots__ = ("robot", "sensor", "epoch", "first", "last")
+    ROBOT_FIELD_NUMBER: _ClassVar[int]
+    SENSOR_FIELD_NUMBER: _ClassVar[int]
+    EPOCH_FIELD_NUMBER: _ClassVar[int]
+    FIRST_FIELD_NUMBER: _ClassVar[int]
+    LAST_FIELD_NUMBER: _ClassVar[int]
+    robot: str
+    sensor: str
+    epoch: int
+    first: int
+    last: int
+    def __init__(self, robot: _Optional[str] = ..., sensor: _Optional[str] = ..., epoch: _Optional[int] = ..., first: _Optional[int] = ..., last: _Optional[int] = ...) -> None: ...
+
 class Loss(_message.Message):
     __slots__ = ("robot", "sensor", "epoch", "first_sequence", "count", "reason", "stamp_ns")
     ROBOT_FIELD_NUMBER: _ClassVar[int]

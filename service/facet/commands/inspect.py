@@ -59,7 +59,8 @@ class Contents:
     firsts: Firsts = field(default_factory=Firsts)
     corrections: Counter[str] = field(default_factory=Counter)  # by robot
     outcomes: Counter[str] = field(default_factory=Counter)  # of corrections, as the log says
-    num_moved: int = 0  # scans, by corrections
+    num_moved: int = 0  # scans, by corrections and erasures
+    num_erasures: int = 0
 
     def note(self, envelope: Envelope) -> None:
         """Count one message."""
@@ -77,6 +78,8 @@ class Contents:
             self.ledger.note(source, envelope.epoch, envelope.sequence)
             if envelope.sequence and not self.firsts.is_first(envelope, source):
                 self.duplicates[source] += 1
+        elif topics.is_erase_topic(envelope.key):
+            self.num_erasures += 1
         elif is_correction(envelope):
             self.corrections[names_of(envelope)[0]] += 1
         elif envelope.key in OWN_TOPICS:
@@ -153,7 +156,7 @@ def _print_contents(recording: Recording, contents: Contents) -> None:
     ]
     table("sources", ("robot/sensor", "scans", "epochs", "missing", "duplicates"), sources)
     out.print(f"{len(contents.cuts):,} updates were cut")
-    if contents.corrections:
+    if contents.corrections or contents.num_erasures:
         _print_corrections(contents)
     if contents.conflicts:
         out.print(
@@ -177,9 +180,11 @@ def _print_contents(recording: Recording, contents: Contents) -> None:
 def _print_corrections(contents: Contents) -> None:
     robots = ", ".join(f"{num:,} of {name}" for name, num in sorted(contents.corrections.items()))
     ends = ", ".join(f"{num:,} {name}" for name, num in sorted(contents.outcomes.items()))
+    erasures = f", {contents.num_erasures:,} erasures" if contents.num_erasures else ""
+    erased = " or erased" if contents.num_erasures else ""
     out.print(
-        f"{contents.corrections.total():,} corrections ({robots}): {ends or 'not applied yet'}; "
-        f"{contents.num_moved:,} scans moved"
+        f"{contents.corrections.total():,} corrections ({robots or 'of none'}){erasures}: "
+        f"{ends or 'not applied yet'}; {contents.num_moved:,} scans moved{erased}"
     )
 
 

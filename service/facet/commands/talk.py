@@ -101,6 +101,7 @@ def cmd(
     facet cmd export format=glb
     facet cmd record                 # start a new log file; the others can be copied
     facet cmd checkpoint             # the next start goes on from here
+    facet cmd erase robot=r1 first=40 last=90   # take scans out, as if they had never come
     """
     try:
         selector = topics.cmd_key(map_id, name)

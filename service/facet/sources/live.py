@@ -24,7 +24,7 @@ from facet.sources.naming import is_input, is_static, names_of, source_of
 from facet_protocol import attachment
 from facet_protocol.messages import Envelope, Loss, ProtocolError
 from facet_protocol.ros_definitions import TRANSFORMS
-from facet_protocol.topics import PREFIX, corrections_key, poses_keys, scans_key
+from facet_protocol.topics import PREFIX, corrections_key, is_erase_topic, poses_keys, scans_key
 
 STATIC_KEYS = ("**/tf_static", "**/tf_static/tf2_msgs::msg::dds_::TFMessage_/*")
 
@@ -268,6 +268,8 @@ class LiveSource:
     def _wanted(self, sample: zenoh.Sample) -> Recognised | None:
         what = self._dialects.recognise(*_names(sample))
         if what is None or what.dialect is Dialect.NATIVE:
+            return None
+        if is_erase_topic(what.topic):  # only the command writes there
             return None
         is_read = is_input(Envelope(what.topic, what.schema, what.encoding, b"", rule=what.rule))
         return what if is_read else None

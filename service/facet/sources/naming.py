@@ -26,6 +26,8 @@ def robot_and_sensor(key: str) -> tuple[str, str]:
             return topics.parse_pose_key(key)
         if topics.is_correction_key(key):
             return topics.parse_correction_key(key)[1], CORRECTION
+        if topics.is_erase_topic(key):
+            return topics.parse_erase_topic(key), CORRECTION
         names = topics.parse_scan_key(key)
     except ProtocolError:
         sensor = re.sub(r"[^A-Za-z0-9_-]+", "_", key).strip("_")[:64] or "scan"
@@ -57,8 +59,8 @@ def is_scan(envelope: Envelope) -> bool:
 
 
 def is_correction(envelope: Envelope) -> bool:
-    """Whether it moves scans that came before."""
-    return topics.is_correction_key(envelope.key)
+    """Whether it moves scans that came before, or takes them out."""
+    return topics.is_correction_key(envelope.key) or topics.is_erase_topic(envelope.key)
 
 
 def is_input(envelope: Envelope) -> bool:
