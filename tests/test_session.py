@@ -142,15 +142,16 @@ def test_a_reader_reads_and_cannot_command(site: Site) -> None:
     with open_session(service_settings(network)) as service:
         answers = [
             service.declare_queryable(f"facet/v1/map/{name}", lambda q: q.reply(q.key_expr, b"yes"))
-            for name in ("snapshot", "cmd/pause")
+            for name in ("snapshot", "cmd/pause", "cmd/erase")
         ]
         with (
             client(site.endpoint, site.certificate_of("desk")) as desk,
             client(site.local, None) as operator,
         ):
             wait_until(lambda: list(desk.get("facet/v1/map/snapshot", timeout=1.0)))
-            assert list(operator.get("facet/v1/map/cmd/pause", timeout=1.0))
-            assert not [r for r in desk.get("facet/v1/map/cmd/pause", timeout=1.0) if r.ok]
+            for command in ("cmd/pause", "cmd/erase?robot=r1"):
+                assert list(operator.get(f"facet/v1/map/{command}", timeout=1.0))
+                assert not [r for r in desk.get(f"facet/v1/map/{command}", timeout=1.0) if r.ok]
         for answer in answers:
             answer.undeclare()
 

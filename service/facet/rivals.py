@@ -111,6 +111,7 @@ class Rivals:
         self._recent: OrderedDict[str, Recent] = OrderedDict()  # the last heard of is the last
         self._window: OrderedDict[Number, Envelope] = OrderedDict()
         self._num_bytes = 0
+        self._hashed, self._digest = Envelope("", "", "", b""), b""
         self._chosen: dict[Number, bytes] = {}
         self._refused: dict[tuple[str, int], Numbers] = {}
 
@@ -120,8 +121,9 @@ class Rivals:
             return None
         if max(envelope.epoch, envelope.sequence) >= 1 << 64:  # a log from elsewhere may say so
             return None
-        number = Number(source, envelope.epoch, envelope.sequence)
-        return Claim(number, hashlib.sha256(envelope.payload).digest())
+        if envelope is not self._hashed:  # most are asked about twice in a row
+            self._hashed, self._digest = envelope, _digest(envelope)
+        return Claim(Number(source, envelope.epoch, envelope.sequence), self._digest)
 
     def meet(self, claim: Claim, *, is_first: bool) -> Verdict:
         """It has come; `is_first`: none with its number had. FIRST and WINS go on to `judge`."""
@@ -262,7 +264,9 @@ class Rivals:
         """In the window: as bytes of its own, for a view would keep a whole chunk."""
         old = self._window.pop(number, None)
         self._num_bytes += len(envelope.payload) - (len(old.payload) if old is not None else 0)
-        self._window[number] = replace(envelope, payload=bytes(envelope.payload))
+        is_view = isinstance(envelope.payload, memoryview)
+        own = replace(envelope, payload=bytes(envelope.payload)) if is_view else envelope
+        self._window[number] = own
         while self._num_bytes > self._window_bytes:
             self._num_bytes -= len(self._window.popitem(last=False)[1].payload)
 
