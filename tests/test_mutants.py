@@ -131,13 +131,13 @@ def test_a_frame_that_stays_as_it_began_is_noticed(monkeypatch: Patch) -> None:
     whole = field.update
 
     def update(
-        self: contours.ContourField, store: object, tiles: object, changed: object, planes: object
+        self: contours.ContourField, store: object, tiles: object, changed: object, normals: object
     ) -> object:
         still = {
-            i: (np.array(self.contours[i].rounded, float) / contours.FRAME_UNIT, members)
+            i: np.array(self.contours[i].rounded, float) / contours.FRAME_UNIT
             if i in self.contours
-            else (normal, members)
-            for i, (normal, members) in planes.items()  # type: ignore[attr-defined]
+            else normal
+            for i, normal in normals.items()  # type: ignore[attr-defined]
         }
         return whole(self, store, tiles, changed, still)  # type: ignore[arg-type]
 

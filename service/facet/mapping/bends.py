@@ -23,15 +23,13 @@ SUMS = 22  # n; sum x (3), xx (6); sum u (3), u x (9): x in 1/8 voxels, u normal
 
 
 @kernel
-def _add_members(store, normals, patches, rows, owner, corner, plane_of, origin, sums):  # type: ignore[no-untyped-def]
+def _add_members(store, normals, patches, rows, corner, starts, plane_of, origin, sums):  # type: ignore[no-untyped-def]
     """Add a tile's pure members to the sums (K, SUMS) of their planes; plane_of (T,), -1: none."""
     blocks, columns = store
     x = np.empty(3, np.int64)
-    low = 0
     for plane in range(plane_of.shape[0]):
-        high = np.searchsorted(owner, plane, side="right")
         k = plane_of[plane]
-        for m in range(low, high if k >= 0 else low):
+        for m in range(starts[plane], starts[plane + 1] if k >= 0 else 0):
             row = rows[m]
             if corner[m] or patches.member[row] < 0 or normals.border[row]:
                 continue
@@ -52,7 +50,6 @@ def _add_members(store, normals, patches, rows, owner, corner, plane_of, origin,
                     s += 1
                 for b in range(3):
                     sums[k, 13 + 3 * a + b] += normals.unit[row, a] * x[b]
-        low = high
 
 
 def _turn(own: NDArray[np.int64]) -> float:
@@ -129,7 +126,7 @@ class Bends:
                 continue
             tile = self._tiles.tiles[key]
             _add_members(
-                (self._store.blocks, self._store.columns), normals, patches, tile.rows, tile.owner,
-                tile.corner, own, origin, sums,
+                (self._store.blocks, self._store.columns), normals, patches, tile.rows, tile.corner,
+                tile.starts, own, origin, sums,
             )  # fmt: skip
         return sums

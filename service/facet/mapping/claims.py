@@ -22,6 +22,7 @@ HALF = 32.0  # 1/8 voxels: half a block
 CHUNK = 16  # blocks that a thread takes at a time
 FEW = 128  # blocks that are not worth waking other threads for
 CORNER_COS = 0.8  # planes that share a corner voxel differ by more than 37 degrees
+FLAT_COS = 0.95  # planes that all are so near to one differ by less from one another
 NX, NY, NZ, OFFSET, WEIGHT = range(5)  # a candidate's plane: unit normal, offset; of its size
 LOW, HIGH = 5, 8  # its box: least and largest x, y, z
 OFF, WAY = 11, 12  # of the voxel in turn: distance from the plane, signed way x, y, z to the box
@@ -284,7 +285,7 @@ def _claim(found, near, count, tolerance, own):  # type: ignore[no-untyped-def]
 def _flat(columns, count):  # type: ignore[no-untyped-def]
     """Whether all candidates look the same way: then there is no corner."""
     for q in range(1, count):  # noqa: SIM110 numba has no all() of a generator
-        if _dot(columns, q, 0) < PARALLEL_COS:
+        if _dot(columns, q, 0) < FLAT_COS:
             return False
     return True
 

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
+from numba import prange
 from numpy.typing import NDArray
 
 from facet.mapping.blocks import unpack
@@ -19,6 +21,8 @@ from facet_protocol.messages import PlaneFrame
 UnitNormal = tuple[int, int, int]
 FRAME_UNIT = 32  # a frame's normal is rounded to 1/32 a component: it moves rarely
 SIZE = CELLS * STEPS  # grid units of a (u, v) tile's edge
+PLACES = 64  # (u, v) tiles that a tile-plane falls into, at most
+PARTS = 16  # that tile-planes are dealt out in; threads take them
 Place = tuple[int, int]  # of a (u, v) tile
 
 
@@ -39,18 +43,57 @@ def make_frame(rounded: UnitNormal, voxel_m: float) -> PlaneFrame:
 
 
 @kernel
-def _project(rows, blocks, block_of, local_of, observable, axis_u, axis_v, out):  # type: ignore[no-untyped-def]
-    """(u, v) in grid units of voxels."""
+def _project(rows, blocks, columns, axes, out):  # type: ignore[no-untyped-def]
+    """(u, v) in grid units of voxels, into out (N, 2)."""
     for m in range(rows.shape[0]):
         row = rows[m]
-        i, j, k = unpack(blocks.keys[block_of[row]])
-        local = local_of[row]
-        seen = observable[row]
+        i, j, k = unpack(blocks.keys[columns.block[row]])
+        local = np.int64(columns.local[row])
+        seen = columns.observable[row]
         x = 64 * i + 8 * (local & 7) + (seen & 15)
         y = 64 * j + 8 * ((local >> 3) & 7) + ((seen >> 4) & 15)
         z = 64 * k + 8 * (local >> 6) + ((seen >> 8) & 15)
-        out[m, 0] = np.floor(x * axis_u[0] + y * axis_u[1] + z * axis_u[2] + 0.5)
-        out[m, 1] = np.floor(x * axis_v[0] + y * axis_v[1] + z * axis_v[2] + 0.5)
+        out[m, 0] = np.floor(x * axes[0, 0] + y * axes[0, 1] + z * axes[0, 2] + 0.5)
+        out[m, 1] = np.floor(x * axes[1, 0] + y * axes[1, 1] + z * axes[1, 2] + 0.5)
+
+
+@kernel
+def _share(uv, points, corner, places):  # type: ignore[no-untyped-def]
+    """Points (N, 2) from their least corner, given as (N, 2) uv, and the (u, v) tiles that they
+    fall into, as tile_u * 2^32 + tile_v, each once. Returns how many tiles."""
+    corner[0], corner[1] = uv[0, 0], uv[0, 1]
+    count, last = 0, np.int64(-(2**62))
+    for p in range(uv.shape[0]):
+        corner[0], corner[1] = min(corner[0], uv[p, 0]), min(corner[1], uv[p, 1])
+        key = (np.int64(uv[p, 0]) // SIZE) * (1 << 32) + np.int64(uv[p, 1]) // SIZE
+        if key == last:
+            continue
+        last = key
+        known = False
+        for s in range(count):
+            known |= places[s] == key
+        if not known and count < PLACES:
+            places[count] = key
+            count += 1
+    for p in range(uv.shape[0]):
+        points[p, 0], points[p, 1] = uv[p, 0] - corner[0], uv[p, 1] - corner[1]
+    return count
+
+
+@kernel(parallel=True)
+def _share_all(  # type: ignore[no-untyped-def]
+    rows, starts, parts, blocks, columns, axes, points, corners, places, num_places
+):
+    """`_share` of S tile-planes, whose rows begin at starts (S + 1,), in frames with axes
+    (S, 2, 3). parts: tile-planes that each thread begins with."""
+    for part in prange(parts.shape[0] - 1):
+        for s in range(parts[part], parts[part + 1]):
+            low, high = starts[s], starts[s + 1]
+            num_places[s] = 0
+            if low < high:
+                uv = np.empty((high - low, 2), np.int32)
+                _project(rows[low:high], blocks, columns, axes[s], uv)
+                num_places[s] = _share(uv, points[low:high], corners[s], places[s])
 
 
 @kernel
@@ -64,33 +107,10 @@ def _paint(points, corner, tile_u, tile_v, cells):  # type: ignore[no-untyped-de
             cells[v >> 3, u >> 3] |= bit
 
 
-@kernel
-def _places(points):  # type: ignore[no-untyped-def]
-    """(u, v) tiles that points (N, 2) fall into, as tile_u * 2^32 + tile_v, each once."""
-    seen = np.empty(64, np.int64)
-    count = 0
-    last = np.int64(-(2**62))
-    for p in range(points.shape[0]):
-        key = (np.int64(points[p, 0]) // SIZE) * (1 << 32) + np.int64(points[p, 1]) // SIZE
-        if key == last:
-            continue
-        last = key
-        known = False
-        for s in range(count):
-            if seen[s] == key:
-                known = True
-                break
-        if not known and count < 64:
-            seen[count] = key
-            count += 1
-    return seen[:count]
-
-
-@dataclass(slots=True)
-class Share:
+class Share(NamedTuple):
     """What one tile-plane gives to its plane's outline."""
 
-    corner: tuple[int, int]  # grid units, the least of its points
+    corner: Place  # grid units, the least of its points
     points: NDArray[np.int16]  # (N, 2) grid units from the corner: a tile is 888 across
     places: frozenset[Place]
 
@@ -116,81 +136,100 @@ class ContourField:
         self._least = settings.min_surface_m2 / (settings.voxel_m / STEPS) ** 2
         self.contours: dict[int, Contour] = {}
         self.rolled = 0  # (u, v) tiles rolled over in the last update
+        self._owners: dict[int, list[tuple[int, int]]] = {}  # by tile key: plane id, tile-plane
 
     def update(
         self,
         store: VoxelStore,
         tiles: dict[int, Tile],
         changed: set[int],
-        planes: dict[int, tuple[NDArray[np.float64], list[tuple[int, int]]]],
+        normals: dict[int, NDArray[np.float64]],
     ) -> set[int]:
-        """Bring the outlines up to date with `planes`: by id, the inside normal and the tile-planes
-        (tile key, number). `changed` are the tiles whose voxels changed.
+        """Bring the outlines up to date with the planes, whose inside normals these are, by id.
+        `changed` are the tiles whose voxels, or plane ids, changed.
 
         Returns ids of the planes whose outlines changed."""
-        self.rolled = 0
-        for gone in self.contours.keys() - planes.keys():
+        for gone in self.contours.keys() - normals.keys():
             del self.contours[gone]
-        different = set()
-        for plane_id in sorted(planes):
-            normal, members = planes[plane_id]
-            rounded = round_normal(normal)
-            contour = self.contours.get(plane_id)
+        wanted = self._reframe(normals, changed)
+        stale: dict[int, set[Place]] = {plane_id: set() for plane_id, _, _ in wanted}
+        for key in sorted(changed):
+            tile = tiles[key]
+            ids = tile.ids.tolist() if tile.num_planes else []
+            stays = [(i, t) for t, i in enumerate(ids) if i]
+            for plane_id, t in set(self._owners.get(key, ())) - set(stays):
+                contour = self.contours.get(plane_id)
+                share = contour.shares.pop((key, t), None) if contour else None
+                if share is not None:
+                    stale.setdefault(plane_id, set()).update(share.places)
+            self._owners[key] = stays
+            wanted.extend((plane_id, key, t) for plane_id, t in stays)
+        for (plane_id, key, t), share in zip(
+            wanted, self._shares(store, tiles, wanted), strict=True
+        ):
+            stale.setdefault(plane_id, set()).update(
+                _exchange(self.contours[plane_id].shares, (key, t), share)
+            )
+        return self._redraw(stale)
+
+    def _reframe(
+        self, normals: dict[int, NDArray[np.float64]], changed: set[int]
+    ) -> list[tuple[int, int, int]]:
+        """Begin the contours of planes that are new, or whose frame turned. Returns (plane id, tile
+        key, tile-plane) of what these had in tiles other than `changed`."""
+        again = []
+        for plane_id, normal in normals.items():
+            rounded, contour = round_normal(normal), self.contours.get(plane_id)
             if contour is None or contour.rounded != rounded:
-                contour = Contour(rounded, make_frame(rounded, self._voxel_m))
-                self.contours[plane_id] = contour
-                different.add(plane_id)
-            if self._refresh(contour, store, tiles, changed, members):
-                different.add(plane_id)
-        return different
+                old = contour.shares if contour else {}
+                again += [(plane_id, key, t) for key, t in old if key not in changed]
+                frame = make_frame(rounded, self._voxel_m)
+                self.contours[plane_id] = Contour(rounded, frame)
+        return again
 
-    def _refresh(
-        self,
-        contour: Contour,
-        store: VoxelStore,
-        tiles: dict[int, Tile],
-        changed: set[int],
-        members: list[tuple[int, int]],
-    ) -> bool:
-        stale: set[Place] = set()
-        wanted = set(members)
-        for member in sorted(contour.shares.keys() - wanted):
-            stale |= contour.shares.pop(member).places
-        for member in members:
-            old = contour.shares.get(member)
-            if old is not None and member[0] not in changed:
-                continue
-            share = self._share(contour.frame, store, tiles[member[0]], member[1])
-            if old is not None:
-                if old.corner == share.corner and np.array_equal(old.points, share.points):
-                    continue
-                stale |= old.places
-            stale |= share.places
-            contour.shares[member] = share
-        near: dict[Place, NDArray[np.bool_]] = {}
-        for place in sorted(stale):
-            self._repaint(contour, place, near)
-        if not near or not self._roll(contour, near):
-            return False
-        edges = [contour.edges[p] for p in sorted(contour.edges) if len(contour.edges[p])]
-        whole = np.concatenate(edges) if edges else np.zeros((0, 4), np.int32)
-        contour.outlines = surfaces_of(whole.astype(np.int64), self._least)
-        return True
-
-    def _share(self, frame: PlaneFrame, store: VoxelStore, tile: Tile, plane: int) -> Share:
-        rows = tile.rows_of(plane)
-        points = np.empty((len(rows), 2), np.int32)
-        _project(
-            rows, store.blocks, store.columns.block, store.columns.local,
-            store.columns.observable, frame.axis_u, frame.axis_v, points,
+    def _shares(
+        self, store: VoxelStore, tiles: dict[int, Tile], wanted: list[tuple[int, int, int]]
+    ) -> list[Share]:
+        """What tile-planes give to the outlines of their planes."""
+        own = [tiles[key].rows_of(t) for _, key, t in wanted]
+        starts = np.concatenate([[0], np.cumsum([len(rows) for rows in own])]).astype(np.int64)
+        rows = np.concatenate([np.zeros(0, np.int32), *own])
+        frames = [self.contours[plane_id].frame for plane_id, _, _ in wanted]
+        axes = np.array([(f.axis_u, f.axis_v) for f in frames], float).reshape(-1, 2, 3)
+        points = np.empty((len(rows), 2), np.int16)
+        corners = np.zeros((len(wanted), 2), np.int32)
+        places, counts = np.empty((len(wanted), PLACES), np.int64), np.empty(len(wanted), np.int64)
+        parts = np.searchsorted(starts, np.linspace(0, starts[-1], PARTS + 1))
+        parts[-1] = len(wanted)
+        _share_all(
+            rows, starts, parts, store.blocks, store.columns, axes, points, corners, places,
+            counts,
         )  # fmt: skip
-        keys = _places(points)
-        places = frozenset(
-            (int((k + (1 << 31)) >> 32), int(((k + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)))
-            for k in keys.tolist()
-        )
-        u, v = points.min(axis=0).tolist() if len(points) else (0, 0)
-        return Share((u, v), (points - np.array([u, v], np.int32)).astype(np.int16), places)
+        ends = starts.tolist()
+        return [
+            Share((u, v), points[low:high], _places(keys[:count]))
+            for (u, v), low, high, keys, count in zip(
+                corners.tolist(), ends, ends[1:], places.tolist(), counts.tolist(), strict=False
+            )
+        ]
+
+    def _redraw(self, stale: dict[int, set[Place]]) -> set[int]:
+        """Draw the (u, v) tiles of planes again. Returns the planes whose outlines changed."""
+        near: dict[tuple[int, Place], NDArray[np.bool_]] = {}
+        for plane_id, places in stale.items():
+            own: dict[Place, NDArray[np.bool_]] = {}
+            contour = self.contours[plane_id]
+            for place in sorted(places):
+                self._repaint(contour, place, own)
+            held = contour.cells.keys() | contour.edges.keys()
+            near.update({(plane_id, place): own[place] for place in sorted(own.keys() & held)})
+        different = self._roll(near)
+        for plane_id in different:
+            contour = self.contours[plane_id]
+            edges = [contour.edges[p] for p in sorted(contour.edges) if len(contour.edges[p])]
+            whole = np.concatenate(edges) if edges else np.zeros((0, 4), np.int32)
+            contour.outlines = surfaces_of(whole.astype(np.int64), self._least)
+        return different
 
     def _repaint(
         self, contour: Contour, place: Place, near: dict[Place, NDArray[np.bool_]]
@@ -218,25 +257,28 @@ class ContourField:
                     wanted = near.setdefault(other, np.zeros((CELLS, CELLS), np.bool_))
                     wanted[own_rows, own_columns] |= marked[rows, columns]
 
-    def _roll(self, contour: Contour, near: dict[Place, NDArray[np.bool_]]) -> bool:
-        """Find the boundary edges that start in the cells `near` again. Whether any changed."""
-        places = sorted(near.keys() & (contour.cells.keys() | contour.edges.keys()))
-        self.rolled += len(places)
-        windows = np.zeros((len(places), SIDE, SIDE), np.uint64)
-        for window, place in zip(windows, places, strict=True):
-            self._fill(window, contour, place)
-        wanted = np.array([near[place] for place in places]).reshape(-1, CELLS, CELLS)
-        moved = False
-        for place, new in zip(places, boundary_edges(windows, wanted), strict=True):
+    def _roll(self, near: dict[tuple[int, Place], NDArray[np.bool_]]) -> set[int]:
+        """Find again the boundary edges that start in the cells `near`, by plane id and (u, v)
+        tile. Returns the planes that have others now."""
+        self.rolled = len(near)
+        windows = np.zeros((len(near), SIDE, SIDE), np.uint64)
+        for window, (plane_id, place) in zip(windows, near, strict=True):
+            self._fill(window, self.contours[plane_id], place)
+        wanted = np.array(list(near.values())).reshape(-1, CELLS, CELLS)
+        different = set()
+        for (plane_id, place), cells, new in zip(
+            near, wanted, boundary_edges(windows, wanted), strict=True
+        ):
+            contour = self.contours[plane_id]
             corner = np.tile(np.array(place, np.int32) * SIZE, 2)
             old = contour.edges.get(place, _NO_EDGES)
             u, v = (old[:, :2] - corner[:2]).T // STEPS
-            stays = ~near[place][v, u]
-            edges = np.concatenate([old[stays], new + corner])
+            edges = np.concatenate([old[~cells[v, u]], new + corner])
             edges = edges[np.lexsort(edges.T)]
-            moved |= not np.array_equal(old, edges)
+            if not np.array_equal(old, edges):
+                different.add(plane_id)
             contour.edges[place] = edges
-        return moved
+        return different
 
     @staticmethod
     def _fill(window: NDArray[np.uint64], contour: Contour, place: Place) -> None:
@@ -248,6 +290,22 @@ class ContourField:
                     window[rows, columns] = cells[own_rows, own_columns]
 
 
+def _places(keys: list[int]) -> frozenset[Place]:
+    return frozenset(((k + _HALF) >> 32, ((k + _HALF) & 0xFFFFFFFF) - _HALF) for k in keys)
+
+
+def _exchange(
+    shares: dict[tuple[int, int], Share], member: tuple[int, int], share: Share
+) -> frozenset[Place]:
+    """Put in a share for another. Returns the (u, v) tiles that look different now."""
+    old = shares.get(member)
+    if old is not None and old.corner == share.corner and np.array_equal(old.points, share.points):
+        return frozenset()
+    shares[member] = share._replace(points=share.points.copy())  # not all that came with it
+    return share.places | (old.places if old is not None else frozenset())
+
+
+_HALF = 1 << 31
 _NOTHING = np.zeros((CELLS, CELLS), np.uint64)
 _NO_EDGES = np.zeros((0, 4), np.int32)
 _PARTS = (  # of a window: which tile, where in the window, and where in that tile

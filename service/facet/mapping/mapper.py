@@ -180,8 +180,8 @@ class Mapper:
         figures = self._figures(ids, grouped.points, members)
         done("identity")
         self._contours.update(
-            self._store, self._tiles.tiles, set(grouped.changed),
-            {i: (figures[i].fit.inside, members[i]) for i in figures},
+            self._store, self._tiles.tiles, {*grouped.changed, *renamed},
+            {i: own.fit.inside for i, own in figures.items()},
         )  # fmt: skip
         done("contours")
         updated = self._describer.update(figures, self._contours.contours, self._free)

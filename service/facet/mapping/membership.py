@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
+from numba import prange
 
-from facet.mapping.bits import trailing_zeros
+from facet.mapping.bits import population, trailing_zeros
 from facet.mapping.blocks import CENTRE, find, pack, row_at, unpack
 from facet.mapping.kernel import kernel
 from facet.mapping.merging import plane_of
@@ -12,10 +13,13 @@ from facet.mapping.settings import BLOCK, STEPS, TILE
 from facet.mapping.sums import SUMS, count_points, read_sums, shift_moments
 
 STRAY = 0.47  # voxels: a voxel whose centroid is so far off its tile-plane is not fitted to
+SHELL = 1000  # blocks of a tile and of the shell round it
+CHUNK = 256  # members that are looked at together
+PURE, MIXED, CLAIMED = range(3)  # what a member is to its tile-plane
 
 
 @kernel
-def collect(blocks, patches, plane_of_patch, tile_key, which, rows, owner, corner):  # type: ignore[no-untyped-def]
+def _collect(blocks, patches, plane_of_patch, tile_key, which, rows, owner, corner):  # type: ignore[no-untyped-def]
     """Voxels of the blocks `which` whose patch, own or claiming, lies in the tile. How many."""
     ti, tj, tk = unpack(tile_key)
     count = 0
@@ -45,73 +49,151 @@ def collect(blocks, patches, plane_of_patch, tile_key, which, rows, owner, corne
 
 
 @kernel
-def shell(table_keys, table_values, tile_key, out):  # type: ignore[no-untyped-def]
+def _shell(blocks, tile_key, out):  # type: ignore[no-untyped-def]
     """Existing blocks of a tile and of the one-block shell round it, by ascending key."""
     ti, tj, tk = unpack(tile_key)
     count = 0
     for i in range(8 * ti - 1, 8 * ti + 9):
         for j in range(8 * tj - 1, 8 * tj + 9):
             for k in range(8 * tk - 1, 8 * tk + 9):
-                block = find(table_keys, table_values, pack(i, j, k))
+                block = find(blocks.table_keys, blocks.table_values, pack(i, j, k))
                 if block >= 0:
                     out[count] = block
                     count += 1
     return count
 
 
+@kernel(parallel=True)
+def find_shells(blocks, tile_keys, near, num_near, room):  # type: ignore[no-untyped-def]
+    """For each tile the blocks that may hold its members, near (N, SHELL) and how many, and room:
+    as many members as there can be."""
+    for n in prange(tile_keys.shape[0]):
+        count = _shell(blocks, tile_keys[n], near[n])
+        voxels = np.int64(0)
+        for q in range(count):
+            for z in range(8):
+                voxels += np.int64(population(blocks.occupied[near[n, q], z]))
+        num_near[n], room[n] = count, 2 * voxels
+
+
+@kernel(parallel=True)
+def collect_members(  # type: ignore[no-untyped-def]
+    blocks, patches, plane_of_patch, tile_keys, near, num_near, first, starts, rows, corner
+):
+    """Members of all tile-planes of tiles: those of tile n from first[n] on, by tile-plane, of
+    which the t-th begins at starts[n, t], counted from there."""
+    for n in prange(tile_keys.shape[0]):
+        room = first[n + 1] - first[n]
+        own, owner, claimed = (
+            np.empty(room, np.int32),
+            np.empty(room, np.int16),
+            np.empty(room, np.bool_),
+        )
+        which = near[n, : num_near[n]]
+        count = _collect(blocks, patches, plane_of_patch, tile_keys[n], which, own, owner, claimed)
+        place = starts[n]
+        place[:] = 0
+        for m in range(count):
+            place[owner[m] + 1] += 1
+        for t in range(1, place.shape[0]):
+            place[t] += place[t - 1]
+        place = place.copy()
+        for m in range(count):  # a stable sort: members stay by block
+            at = first[n] + place[owner[m]]
+            place[owner[m]] += 1
+            rows[at], corner[at] = own[m], claimed[m]
+
+
 @kernel
-def inherit(old_rows, old_owner, old_corner, rows, owner, corner, scratch, counts):  # type: ignore[no-untyped-def]
-    """counts[old, new]: voxels that went from one tile-plane to another. scratch (V,) stays 0."""
-    for m in range(old_rows.shape[0]):
-        if not old_corner[m]:
-            scratch[old_rows[m]] = old_owner[m] + 1
+def inherit(old, new, scratch, counts):  # type: ignore[no-untyped-def]
+    """counts[old, new]: voxels that went from one tile-plane to another; old and new: rows (M,),
+    corner (M,), and where each tile-plane starts. scratch (V,) stays 0."""
+    rows, corner, starts = old
+    for t in range(starts.shape[0] - 1):
+        for m in range(starts[t], starts[t + 1]):
+            if not corner[m]:
+                scratch[rows[m]] = t + 1
+    rows, corner, starts = new
+    for t in range(starts.shape[0] - 1):
+        for m in range(starts[t], starts[t + 1]):
+            if not corner[m] and scratch[rows[m]] > 0:
+                counts[scratch[rows[m]] - 1, t] += 1
+    rows = old[0]
     for m in range(rows.shape[0]):
-        if not corner[m] and scratch[rows[m]] > 0:
-            counts[scratch[rows[m]] - 1, owner[m]] += 1
-    for m in range(old_rows.shape[0]):
-        scratch[old_rows[m]] = 0
+        scratch[rows[m]] = 0
 
 
-@kernel
+@kernel(parallel=True)
 def sum_points(  # type: ignore[no-untyped-def]
-    rows, owner, corner, tile_key, blocks, columns, border, second, nodes, points, total
+    rows, corner, starts, tile_keys, shares, blocks, columns, border, second, nodes, points, total
 ):
     """Sum the voxels' point moments about the tile's corner into points (T, 10), without those
     that hold points of others: at a border, claimed by a plane at an angle, or STRAY from their
     tile-plane; count all in total (T,).
 
+    rows, corner: members of T tile-planes, one after another, those of t from starts[t] on;
+    tile_keys: (T,); shares: (S + 1,) tile-planes that each thread begins with.
     Leftovers count as well: the tails of the noise lie in them, and without these a plane across
     the grid is bent by where the grid cuts it."""
+    for share in prange(shares.shape[0] - 1):
+        places = np.empty((CHUNK, 3), np.int64)
+        state = np.empty(CHUNK, np.int8)
+        for t in range(shares[share], shares[share + 1]):
+            points[t] = 0
+            total[t] = 0
+            plane = _seen_from(nodes, t, tile_keys[t])
+            for start in range(starts[t], starts[t + 1], CHUNK):
+                stop = min(starts[t + 1], start + CHUNK)
+                own = rows[start:stop], corner[start:stop]
+                _look(own, blocks, columns, border, second, tile_keys[t], plane, places, state)
+                total[t] += _add(own[0], columns, places, state, points[t])
+
+
+@kernel
+def _seen_from(nodes, t, tile_key):  # type: ignore[no-untyped-def]
+    """Unit normal of a tile-plane, and its offset from the corner of the tile, voxels."""
     ti, tj, tk = unpack(tile_key)
-    count = total.shape[0]
-    normals, offsets = np.empty((count, 3)), np.empty(count)
-    for t in range(count):
-        nx, ny, nz, _, _ = plane_of(nodes.votes[t], nodes.scatter[t], nodes.unit[t])
-        normals[t, 0], normals[t, 1], normals[t, 2] = nx, ny, nz
-        mean = nodes.mean[t]
-        offsets[t] = (
-            nx * (mean[0] - TILE * ti) + ny * (mean[1] - TILE * tj) + nz * (mean[2] - TILE * tk)
-        )
-    sums = np.empty(SUMS, np.int64)
-    for m in range(rows.shape[0]):
-        if corner[m]:
-            continue
-        row, own = rows[m], owner[m]
-        seen = columns.observable[row]
+    nx, ny, nz, _, _ = plane_of(nodes.votes[t], nodes.scatter[t], nodes.unit[t])
+    mean = nodes.mean[t]
+    offset = nx * (mean[0] - TILE * ti) + ny * (mean[1] - TILE * tj) + nz * (mean[2] - TILE * tk)
+    return nx, ny, nz, offset
+
+
+@kernel
+def _look(own, blocks, columns, border, second, tile_key, plane, places, state):  # type: ignore[no-untyped-def]
+    """Where members lie in their tile, voxels, and what they are: PURE, not, or only claimed."""
+    rows, corner = own
+    ti, tj, tk = unpack(tile_key)
+    nx, ny, nz, offset = plane
+    for m in range(rows.shape[0]):  # nothing here waits for the last member
+        row = rows[m]
         i, j, k = unpack(blocks.keys[columns.block[row]])
         local = np.int64(columns.local[row])
+        seen = columns.observable[row]
         x = BLOCK * i - TILE * ti + (local & 7)
         y = BLOCK * j - TILE * tj + ((local >> 3) & 7)
         z = BLOCK * k - TILE * tk + (local >> 6)
+        places[m, 0], places[m, 1], places[m, 2] = x, y, z
         off = (
-            normals[own, 0] * (x + (seen & 15) / STEPS)
-            + normals[own, 1] * (y + ((seen >> 4) & 15) / STEPS)
-            + normals[own, 2] * (z + ((seen >> 8) & 15) / STEPS)
-            - offsets[own]
+            nx * (x + (seen & 15) / STEPS)
+            + ny * (y + ((seen >> 4) & 15) / STEPS)
+            + nz * (z + ((seen >> 8) & 15) / STEPS)
+            - offset
         )
-        if border[row] or second[row] >= 0 or abs(off) > STRAY:
-            total[own] += count_points(columns, row)
-            continue
-        read_sums(columns, row, sums)
-        total[own] += sums[0]
-        shift_moments(sums, x, y, z, points[own])
+        mixed = border[row] | (second[row] >= 0) | (abs(off) > STRAY)
+        state[m] = CLAIMED if corner[m] else MIXED if mixed else PURE
+
+
+@kernel
+def _add(rows, columns, places, state, points):  # type: ignore[no-untyped-def]
+    """Add the moments of PURE members to points (10,). Returns the points of all."""
+    total = np.int64(0)
+    sums = np.empty(SUMS, np.int64)
+    for m in range(rows.shape[0]):
+        if state[m] == PURE:
+            read_sums(columns, rows[m], sums)
+            total += sums[0]
+            shift_moments(sums, places[m, 0], places[m, 1], places[m, 2], points)
+        elif state[m] == MIXED:
+            total += count_points(columns, rows[m])
+    return total

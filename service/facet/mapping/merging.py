@@ -210,6 +210,17 @@ def merge(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-
     return parent
 
 
+@kernel
+def merge_all(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-def]
+    """`merge` along all edges (E, 2), which must come in a canonical order, best first."""
+    costs = edge_costs(votes, mean, scatter, unit, edges, limit)
+    order = np.argsort(costs, kind="mergesort")
+    count = 0
+    while count < order.shape[0] and costs[order[count]] < np.inf:
+        count += 1
+    return merge(votes, mean, scatter, unit, edges[order[:count]], limit)
+
+
 def merge_nodes(
     nodes: Nodes, edges: NDArray[np.int64], limit: Limits
 ) -> tuple[NDArray[np.int64], Nodes]:
@@ -219,7 +230,4 @@ def merge_nodes(
     merged = Nodes(*(column.copy() for column in nodes))
     if not len(edges):
         return np.arange(len(nodes.votes)), merged
-    costs = edge_costs(*nodes, edges, limit)
-    order = np.argsort(costs, kind="stable")
-    order = order[np.isfinite(costs[order])]
-    return merge(*merged, np.ascontiguousarray(edges[order]), limit), merged
+    return merge_all(*merged, edges, limit), merged

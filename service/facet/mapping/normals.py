@@ -32,8 +32,8 @@ from facet.mapping.store import VoxelStore
 
 CLASS_NAMES = ("empty", "valid", "aligned", "thick", "sparse", "mixed")
 SAME, CHANGED = 0, 1  # what became of a voxel, or WIDER
-NARROW, WIDE = 4, 10  # voxels that the first and the second halo of a block reach beyond it
-SHARES = 8  # parts that the blocks are dealt out to; threads take them
+NARROW, WIDE = 4, 8  # voxels that the first and the second halo of a block reach beyond it
+SHARES = 16  # parts that the blocks are dealt out to; threads take them
 
 
 class Normals(NamedTuple):
@@ -112,7 +112,8 @@ def _refresh(blocks, columns, normals, deepest, dirty, which, rule, halos, count
     turned (C,) whether any of them changed.
 
     Every voxel depends on observables alone and writes its own place: threads change nothing."""
-    for share in prange(halos.rows.shape[0]):
+    shares = halos.rows.shape[0]
+    for share in prange(shares):
         halo = Halo(halos.listed[share], halos.rows[share], halos.first[share], halos.near[share])
         scratch = (
             np.empty((LISTS, MOST + 16), np.int32),  # 16: columns start on different cache sets
@@ -120,7 +121,8 @@ def _refresh(blocks, columns, normals, deepest, dirty, which, rule, halos, count
             np.zeros(SUMS, np.int64),
         )
         stale = np.zeros(8, np.uint64)
-        for q in range(share, which.shape[0], halos.rows.shape[0]):
+        start = share * which.shape[0] // shares  # blocks beside one another share cache lines
+        for q in range(start, (share + 1) * which.shape[0] // shares):
             block = which[q]
             counts[q] = find_stale(
                 blocks, dirty, normals.reach, block, deepest[1 + block], rule.start,

@@ -7,22 +7,23 @@ their tile-plane, never the plane, so a merge of planes relabels nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from facet.mapping.blocks import CENTRE, pack, pack_all, unpack, unpack_all
+from facet.mapping.blocks import pack, pack_all, unpack, unpack_all
+from facet.mapping.growth import grow_tiles, pair_tiles
 from facet.mapping.kernel import kernel
-from facet.mapping.membership import collect, inherit, shell, sum_points
+from facet.mapping.membership import SHELL, collect_members, find_shells, inherit, sum_points
 from facet.mapping.memory import Heap, Memory
-from facet.mapping.merging import Limits, Nodes, merge_nodes
-from facet.mapping.normals import UNIT, Normals
+from facet.mapping.merging import Limits, Nodes
+from facet.mapping.normals import Normals
 from facet.mapping.patches import PER_BLOCK, PatchField
-from facet.mapping.settings import BLOCK, STEPS
 from facet.mapping.store import VoxelStore
 from facet.mapping.sums import MOMENTS
 
-SIDE = 8  # blocks per tile edge
+SHARES = 16  # parts that members are dealt out in; threads take them
 
 
 @dataclass(slots=True)
@@ -36,9 +37,9 @@ class Tile:
     # near its tile-plane, not at a border, and claimed by no plane at an angle
     total: NDArray[np.int64]  # (T,) points of all their voxels
     occupation: NDArray[np.int64]  # (T,) voxels, leftovers included
-    rows: NDArray[np.int32]  # (M,) voxel rows of its tile-planes
-    owner: NDArray[np.int16]  # (M,) their tile-plane, ascending
+    rows: NDArray[np.int32]  # (M,) voxel rows of its tile-planes, one after another
     corner: NDArray[np.bool_]  # (M,) only a claim on a corner voxel that belongs elsewhere
+    starts: NDArray[np.int64]  # (T + 1,) where the rows of each tile-plane begin
     pairs: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 3), np.int64))
     # pairs: (own tile-plane, key of the other tile, its tile-plane), adjacent
     ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
@@ -52,104 +53,12 @@ class Tile:
 
     def rows_of(self, plane: int) -> NDArray[np.int32]:
         """Voxel rows of one of its tile-planes, a view."""
-        low, high = np.searchsorted(self.owner, [plane, plane + 1])
-        return self.rows[low:high]
+        return self.rows[self.starts[plane] : self.starts[plane + 1]]
 
-
-@kernel
-def _tile_nodes(block_keys, neighbours, patches, which, tile_key):  # type: ignore[no-untyped-def]
-    """Nodes and candidate edges of a tile's patches, in order of block key and patch index."""
-    count = 0
-    first = np.full(512, -1, np.int64)
-    ti, tj, tk = unpack(tile_key)
-    place = np.empty(which.shape[0], np.int64)
-    for q in range(which.shape[0]):
-        i, j, k = unpack(block_keys[which[q]])
-        place[q] = (i - 8 * ti) + 8 * (j - 8 * tj) + 64 * (k - 8 * tk)
-        first[place[q]] = count
-        count += patches.number[which[q]]
-    votes = np.empty(count)
-    mean = np.empty((count, 3))
-    scatter = np.empty((count, 6))
-    unit = np.empty((count, 3))
-    t = 0
-    num_edges = 0
-    edges = np.empty((max(64, 64 * count), 2), np.int64)
-    for q in range(which.shape[0]):
-        block = which[q]
-        i, j, k = unpack(block_keys[block])
-        corner = (BLOCK * i, BLOCK * j, BLOCK * k)
-        for p in range(patches.number[block]):
-            v = float(patches.votes[block, p])
-            votes[t] = v
-            c = patches.centroid[block, p]
-            for a in range(3):
-                mean[t, a] = corner[a] + c[a] / (STEPS * v)
-                unit[t, a] = patches.unit[block, p, a] / float(UNIT)
-            s = 0
-            for a in range(3):
-                for b in range(a, 3):
-                    total = patches.scatter[block, p, s] - float(c[a]) * c[b] / v
-                    scatter[t, s] = total / (STEPS * STEPS)
-                    s += 1
-            t += 1
-        for n in range(CENTRE, 27):
-            di, dj, dk = n % 3 - 1, (n // 3) % 3 - 1, n // 9 - 1
-            x, y, z = i - 8 * ti + di, j - 8 * tj + dj, k - 8 * tk + dk
-            if not (0 <= x < 8 and 0 <= y < 8 and 0 <= z < 8):
-                continue
-            other = block if n == CENTRE else neighbours[block, n]
-            if other < 0:
-                continue
-            start = first[x + 8 * y + 64 * z]
-            for p in range(patches.number[block]):
-                for o in range(patches.number[other]):
-                    if n == CENTRE and o <= p:
-                        continue
-                    if num_edges == edges.shape[0]:
-                        wider = np.empty((2 * num_edges, 2), np.int64)
-                        wider[:num_edges] = edges
-                        edges = wider
-                    edges[num_edges, 0] = first[place[q]] + p
-                    edges[num_edges, 1] = start + o
-                    num_edges += 1
-    return votes, mean, scatter, unit, edges[:num_edges]
-
-
-@kernel
-def _pairs(blocks, patches, plane_of_patch, tile_key, which, out):  # type: ignore[no-untyped-def]
-    """Adjacent tile-planes, the smaller tile first, as own << 32 | place of the other tile among
-    the 27 << 16 | other; with repetitions. How many, or -1 where `out` is too short."""
-    count = 0
-    ti, tj, tk = unpack(tile_key)
-    for q in range(which.shape[0]):
-        block = which[q]
-        i, j, k = unpack(blocks.keys[block])
-        last = np.int64(-1)
-        for n in range(27):
-            other = block if n == CENTRE else blocks.neighbours[block, n]
-            if other < 0 or patches.number[other] == 0:
-                continue
-            x, y, z = i + n % 3 - 1, j + (n // 3) % 3 - 1, k + n // 9 - 1
-            other_key = pack(x >> 3, y >> 3, z >> 3)
-            if other_key < tile_key:
-                continue
-            place = ((x >> 3) - ti + 1) + 3 * ((y >> 3) - tj + 1) + 9 * ((z >> 3) - tk + 1)
-            for p in range(patches.number[block]):
-                for o in range(patches.number[other]):
-                    a = np.int64(plane_of_patch[block, p])
-                    b = np.int64(plane_of_patch[other, o])
-                    if other_key == tile_key and a >= b:
-                        continue
-                    pair = (a << 32) | (place << 16) | b
-                    if pair == last:
-                        continue
-                    if count == out.shape[0]:
-                        return -1
-                    out[count] = pair
-                    last = pair
-                    count += 1
-    return count
+    @property
+    def owner(self) -> NDArray[np.int64]:
+        """(M,) tile-plane of each row."""
+        return np.repeat(np.arange(self.num_planes), np.diff(self.starts))
 
 
 @kernel
@@ -206,18 +115,14 @@ class TileField:
             regroup = sorted(self._blocks)
         else:
             regroup = [int(k) for k in np.unique(tile_keys_of(keys[regrouped]))]
-        for key in regroup:
-            self._grow(store, patches, key, limits)
+        self._grow(store, patches, regroup, limits)
         moved = np.unique(np.concatenate([regrouped, relabelled, dirty]))
         stale = spread(np.array(regroup, np.int64), keys[moved])
         changed = [int(k) for k in stale if int(k) in self.tiles]
-        for key in changed:
-            self._fill(store, patches, self.tiles[key])
-        for key in np.union1d(changed, spread(np.zeros(0, np.int64), keys[summed])).tolist():
-            if key in self.tiles:
-                self._sum(store, normals, patches, self.tiles[key])
-        for key in self._beside(regroup):
-            self._pair(store, patches, self.tiles[key])
+        self._fill(store, patches, changed)
+        near = np.union1d(changed, spread(np.zeros(0, np.int64), keys[summed])).tolist()
+        self._sum(store, normals, patches, [int(k) for k in near if int(k) in self.tiles])
+        self._pair(store, patches, self._beside(regroup))
         return regroup, changed
 
     def name(
@@ -258,50 +163,95 @@ class TileField:
                 self.tiles[key] = _empty_tile(key, members)
         self._num_blocks = count
 
-    def _grow(self, store: VoxelStore, patches: PatchField, key: int, limits: Limits) -> None:
-        tile = self.tiles[key]
-        votes, mean, scatter, unit, edges = _tile_nodes(
-            store.blocks.keys, store.blocks.neighbours, patches.patches, tile.blocks, key
-        )
-        roots, merged = merge_nodes(Nodes(votes, mean, scatter, unit), edges, limits)
-        kept, index = np.unique(roots, return_inverse=True)
-        tile.nodes = Nodes(*(np.ascontiguousarray(c[kept]) for c in merged))
-        counts = patches.patches.number[tile.blocks]
-        where = np.arange(PER_BLOCK)[None, :] < counts[:, None]
-        plane_of_patch = np.zeros((len(tile.blocks), PER_BLOCK), np.int16)
-        plane_of_patch[where] = index
-        self.plane_of_patch[tile.blocks] = plane_of_patch
+    def _members(self, keys: list[int]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+        """Blocks of tiles, one tile after another, and where each begins (N + 1,)."""
+        own = [self.tiles[key].blocks for key in keys]
+        return np.concatenate([_NO_ROWS, *own]), _starts([len(blocks) for blocks in own])
 
-    def _fill(self, store: VoxelStore, patches: PatchField, tile: Tile) -> None:
-        near = np.empty(1000, np.int32)
-        near = near[: shell(store.blocks.table_keys, store.blocks.table_values, tile.key, near)]
-        most = 2 * int(np.bitwise_count(store.blocks.occupied[near]).sum())
-        rows, owner = np.empty(most, np.int32), np.empty(most, np.int16)
-        corner = np.empty(most, np.bool_)
-        count = collect(
-            store.blocks, patches.patches, self.plane_of_patch, tile.key, near, rows, owner, corner
-        )
+    def _grow(
+        self, store: VoxelStore, patches: PatchField, keys: list[int], limits: Limits
+    ) -> None:
+        """Merge the patches of tiles into tile-planes."""
+        members, member_starts = self._members(keys)
+        number = patches.patches.number[members].astype(np.int64)
+        first = _starts(number)[member_starts]
+        size = int(first[-1])
+        nodes = Nodes(np.empty(size), np.empty((size, 3)), np.empty((size, 6)), np.empty((size, 3)))
+        index = np.empty(size, np.int16)
+        counts = grow_tiles(
+            store.blocks, patches.patches, members, member_starts, np.array(keys, np.int64),
+            first, nodes, index, limits,
+        )  # fmt: skip
+        for key, start, count in zip(keys, first.tolist(), counts.tolist(), strict=False):
+            self.tiles[key].nodes = Nodes(*(c[start : start + count].copy() for c in nodes))
+        plane_of_patch = np.zeros((len(members), PER_BLOCK), np.int16)
+        plane_of_patch[np.arange(PER_BLOCK)[None, :] < number[:, None]] = index
+        self.plane_of_patch[members] = plane_of_patch
+
+    def _fill(self, store: VoxelStore, patches: PatchField, keys: list[int]) -> None:
+        """Find the members of the tile-planes of tiles, and what these inherit."""
+        tile_keys = np.array(keys, np.int64)
+        near, num_near = np.empty((len(keys), SHELL), np.int32), np.empty(len(keys), np.int64)
+        room = np.empty(len(keys), np.int64)
+        find_shells(store.blocks, tile_keys, near, num_near, room)
+        first = _starts(room)
+        rows, corner = np.empty(first[-1], np.int32), np.empty(first[-1], np.bool_)
+        most = max((self.tiles[key].num_planes for key in keys), default=0)
+        starts = np.empty((len(keys), most + 1), np.int64)
+        collect_members(
+            store.blocks, patches.patches, self.plane_of_patch, tile_keys, near, num_near, first,
+            starts, rows, corner,
+        )  # fmt: skip
+        for key, start, own in zip(keys, first.tolist(), starts, strict=False):
+            tile = self.tiles[key]
+            own = own[: tile.num_planes + 1].copy()
+            part = slice(start, start + int(own[-1]))
+            self._take_over(store, tile, rows[part].copy(), corner[part].copy(), own)
+
+    def _take_over(
+        self,
+        store: VoxelStore,
+        tile: Tile,
+        rows: NDArray[np.int32],
+        corner: NDArray[np.bool_],
+        starts: NDArray[np.int64],
+    ) -> None:
+        """Give a tile its new members."""
         if len(self._scratch) < len(store.columns.block):
             self._scratch = np.zeros(len(store.columns.block), np.int16)
         counts = np.zeros((len(tile.ids), tile.num_planes), np.int64)
-        order = np.argsort(owner[:count], kind="stable")
-        new = rows[order], owner[order], corner[order]
-        inherit(tile.rows, tile.owner, tile.corner, *new, self._scratch, counts)
+        new = rows, corner, starts
+        inherit((tile.rows, tile.corner, tile.starts), new, self._scratch, counts)
         old, own = np.nonzero(counts)
         tile.heritage = np.stack([tile.ids[old], own, counts[old, own]], axis=1)
-        tile.rows, tile.owner, tile.corner = new
+        tile.rows, tile.corner, tile.starts = new
         tile.named = False
-        tile.occupation = np.bincount(tile.owner[~tile.corner], minlength=tile.num_planes).astype(
-            np.int64
-        )
+        claims = np.concatenate([[0], np.cumsum(corner)])
+        tile.occupation = np.diff(starts - claims[starts])
 
-    def _sum(self, store: VoxelStore, normals: Normals, patches: PatchField, tile: Tile) -> None:
-        tile.points = np.zeros((tile.num_planes, MOMENTS), np.int64)
-        tile.total = np.zeros(tile.num_planes, np.int64)
+    def _sum(
+        self, store: VoxelStore, normals: Normals, patches: PatchField, keys: list[int]
+    ) -> None:
+        """Sum the points of the tile-planes of tiles."""
+        tiles = [self.tiles[key] for key in keys]
+        if not tiles:
+            return
+        own = _starts([tile.num_planes for tile in tiles])
+        starts = _starts(np.concatenate([np.diff(tile.starts) for tile in tiles]))
+        points = np.empty((int(own[-1]), MOMENTS), np.int64)
+        total = np.empty(len(points), np.int64)
+        shares = np.searchsorted(starts, np.linspace(0, starts[-1], SHARES + 1))
+        shares[-1] = len(points)
         sum_points(
-            tile.rows, tile.owner, tile.corner, tile.key, store.blocks, store.columns,
-            normals.border, patches.patches.second, tile.nodes, tile.points, tile.total,
+            np.concatenate([tile.rows for tile in tiles]),
+            np.concatenate([tile.corner for tile in tiles]),
+            starts, np.repeat([tile.key for tile in tiles], np.diff(own)), shares, store.blocks,
+            store.columns, normals.border, patches.patches.second,
+            Nodes(*(np.concatenate(c) for c in zip(*(t.nodes for t in tiles), strict=True))),
+            points, total,
         )  # fmt: skip
+        for tile, low, high in zip(tiles, own[:-1].tolist(), own[1:].tolist(), strict=True):
+            tile.points, tile.total = points[low:high].copy(), total[low:high].copy()
 
     def _beside(self, keys: list[int]) -> list[int]:
         """The tiles and their 26 neighbours, as far as they exist, ascending."""
@@ -313,21 +263,30 @@ class TileField:
             )
         return sorted(near & self.tiles.keys())
 
-    def _pair(self, store: VoxelStore, patches: PatchField, tile: Tile) -> None:
+    def _pair(self, store: VoxelStore, patches: PatchField, keys: list[int]) -> None:
+        """Find which tile-planes of tiles touch others."""
+        members, member_starts = self._members(keys)
+        tile_keys, counts = np.array(keys, np.int64), np.empty(len(keys), np.int64)
         room = 4096
         while True:
-            out = np.empty(room, np.int64)
-            count = _pairs(
-                store.blocks, patches.patches, self.plane_of_patch, tile.key, tile.blocks, out
-            )
-            if count >= 0:
+            pairs = np.empty((len(keys), room, 3), np.int64)
+            pair_tiles(
+                store.blocks, patches.patches, self.plane_of_patch, members, member_starts,
+                tile_keys, pairs, counts,
+            )  # fmt: skip
+            if not (counts < 0).any():
                 break
             room *= 4
-        pairs = np.unique(out[:count])
-        place = (pairs >> 16) & 0xFFFF
-        offset = np.stack([place % 3, (place // 3) % 3, place // 9], axis=1) - 1
-        other = pack_all(np.array(unpack(tile.key)) + offset)
-        tile.pairs = np.stack([pairs >> 32, other, pairs & 0xFFFF], axis=1)
+        for key, own, count in zip(keys, pairs, counts.tolist(), strict=True):
+            self.tiles[key].pairs = own[:count].copy()
+
+
+def _starts(sizes: Any) -> NDArray[np.int64]:
+    """(N + 1,) where things of these sizes (N,) begin that lie one after another."""
+    return np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)]).astype(np.int64)
+
+
+_NO_ROWS = np.zeros(0, np.int32)
 
 
 def _empty_tile(key: int, blocks: NDArray[np.int32]) -> Tile:
@@ -335,5 +294,5 @@ def _empty_tile(key: int, blocks: NDArray[np.int32]) -> Tile:
     return Tile(
         key, blocks, nodes, np.zeros((0, MOMENTS), np.int64),
         np.zeros(0, np.int64), np.zeros(0, np.int64),
-        np.zeros(0, np.int32), np.zeros(0, np.int16), np.zeros(0, np.bool_),
+        np.zeros(0, np.int32), np.zeros(0, np.bool_), np.zeros(1, np.int64),
     )  # fmt: skip
