@@ -132,6 +132,7 @@ from facet_protocol.topics import scan_key
 endpoint, rate = sys.argv[1], float(sys.argv[2])
 with open_session(client_settings(endpoint, shared_memory=False)) as session:
     publisher = session.declare_publisher(scan_key("map", "junk", "lidar"))
+    print("ready", flush=True)
     sys.stdin.readline()
     started, num = time.monotonic(), 0
     while True:
