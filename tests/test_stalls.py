@@ -20,22 +20,23 @@ from facet.sources.recording import Recording
 from facet.status import balance_of
 from facet_protocol import attachment, topics
 from facet_protocol.codec import decode
-from facet_protocol.messages import Loss, Status
+from facet_protocol.messages import Envelope, Loss, Status
 from fault_rig import envelopes
-from rig import START_NS, wait_until
+from rig import START_NS, room, wait_until
 from tcp_proxy import Proxy
 from test_commands import Running
 
-SCAN = envelopes("r1", 1)[0]  # of 300 points: what fits into our publisher's cache is a minute
+SCAN = room(1)[0]  # 54 kB: eight seconds of them fit into no socket
+SMALL = envelopes("r1", 1)[0]  # a minute of them fits into our publisher's cache
 RATE_HZ = 40
 
 
 class Sender:
     """A robot that sends at RATE_HZ until it is stopped; `sent` is the truth."""
 
-    def __init__(self, endpoint: str, robot: str) -> None:
+    def __init__(self, endpoint: str, robot: str, scan: Envelope = SCAN) -> None:
         self.sent, self.worst_put_s = 0, 0.0
-        self._endpoint, self._robot = endpoint, robot
+        self._endpoint, self._robot, self._scan = endpoint, robot, scan
         self._stop = threading.Event()
         self._done = threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
@@ -67,7 +68,7 @@ class Sender:
 
     def _ours(self, session: zenoh.Session) -> Any:
         publisher = RobotPublisher(session, "map")
-        return lambda: publisher.publish("ours", "lidar", SCAN)
+        return lambda: publisher.publish("ours", "lidar", self._scan)
 
     def _plain(self, session: zenoh.Session) -> Any:
         key = topics.scan_key("map", self._robot, "lidar")
@@ -80,7 +81,7 @@ class Sender:
 
         def put() -> None:
             mark = attachment.pack(7, self.sent + 1, START_NS + self.sent)
-            publisher.put(SCAN.payload, attachment=mark)
+            publisher.put(self._scan.payload, attachment=mark)
 
         return put
 
@@ -173,12 +174,12 @@ def test_g14_the_service_stalls(tmp_path: Path) -> None:
     checks_the_log(tmp_path / "log", lost)
 
 
-def outage(folder: Path, seconds: float) -> None:
+def outage(folder: Path, seconds: float, scan: Envelope = SCAN) -> None:
     """F25: the network is down and comes back."""
     service = Running(folder)
     try:
         with Proxy(service.endpoint) as network, watched(service.endpoint) as seen:
-            senders = {robot: Sender(network.endpoint, robot) for robot in ("ours", "plain")}
+            senders = {r: Sender(network.endpoint, r, scan) for r in ("ours", "plain")}
             wait_until(lambda: min(counted(seen, r)[0] for r in senders) > 10, 20)
             network.cut()
             time.sleep(seconds)  # the fault itself
@@ -204,4 +205,4 @@ def test_g14_the_network_fails(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_g14_the_network_fails_for_a_minute(tmp_path: Path) -> None:
     """Within the cache of our publisher: 4096 scans, or 64 MB of them."""
-    outage(tmp_path / "log", 60.0)
+    outage(tmp_path / "log", 60.0, SMALL)
