@@ -84,6 +84,14 @@ class Watch:
         self.victim.end()
         self._reader.join(5.0)
 
+    def __enter__(self) -> Watch:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Whatever went wrong, the victim does not outlive it."""
+        self._robots.stopping.set()
+        self.victim.end()
+
     def between(self, start: float, end: float) -> Latencies:
         """Of every message sent from `start` to `end`, s of `perf_counter`. None may be missing,
         but the last ones."""
@@ -105,14 +113,15 @@ class Watch:
 
 def acknowledged(folder: Path, seconds: float) -> tuple[Latencies, Latencies]:
     """(ms until each message was durable, ms that the disk took for itself meanwhile)."""
-    watch, disk = Watch(folder / "log"), Disk(folder)
-    watch.start()
-    time.sleep(WARM_S)
-    disk.start()
-    start = time.perf_counter()
-    time.sleep(seconds)
-    end, own = time.perf_counter(), disk.stop()
-    watch.stop()
+    disk = Disk(folder)
+    with Watch(folder / "log") as watch:
+        watch.start()
+        time.sleep(WARM_S)
+        disk.start()
+        start = time.perf_counter()
+        time.sleep(seconds)
+        end, own = time.perf_counter(), disk.stop()
+        watch.stop()
     return watch.between(start, end), own
 
 
@@ -171,8 +180,7 @@ def flood(endpoint: str) -> Iterator[Any]:
 def test_s4_a_flood_delays_no_one(tmp_path: Path) -> None:
     """p99 at most twice what it was, beside connections that say nothing and a robot that sends
     five times as many messages as all others, all of them junk."""
-    watch = Watch(tmp_path / "log")
-    with flood(watch.victim.endpoint) as loose:
+    with Watch(tmp_path / "log") as watch, flood(watch.victim.endpoint) as loose:
         watch.start()
         time.sleep(WARM_S)
         marks = [time.perf_counter()]
@@ -181,6 +189,6 @@ def test_s4_a_flood_delays_no_one(tmp_path: Path) -> None:
         loose()
         time.sleep(4.0)
         marks.append(time.perf_counter())
-    watch.stop()
+        watch.stop()
     quiet, beside = (np.percentile(watch.between(a, b), 99) for a, b in pairwise(marks))
     assert beside <= 2.0 * quiet, f"{quiet:.0f} ms, beside the flood {beside:.0f} ms"
