@@ -144,7 +144,7 @@ def test_settle_tells_what_changed_and_only_that() -> None:
     assert len(store.settle()) == 0
     before = store.columns.observable.copy()
     store.insert(ticks_of(1, 300))
-    touched = set(store.touched_rows.tolist())
+    touched = set(store.touched.rows.tolist())
     dirty = set(store.settle().tolist())
     changed = set(
         np.flatnonzero(before[: store.num_rows] != store.columns.observable[: store.num_rows])

@@ -24,7 +24,7 @@ def num_voxels(mapper: Mapper) -> int:
 def points_in_view(mapper: Mapper, scan: Scan) -> NDArray[np.int64]:
     """(W,) points of each voxel that a scan touches. Call it right after the scan's insert."""
     store = mapper._store
-    return store.num_points(store.touched_rows)
+    return store.num_points(store.touched.rows)
 
 
 def forget_touched(mapper: Mapper, scan: Scan) -> NDArray[np.int64]:

@@ -28,8 +28,9 @@ def freeze(mapper: Mapper) -> dict[str, NDArray[Any]]:
 
     Raises ValueError where scans were inserted since."""
     store, tiles = mapper._store, mapper._tiles.tiles
-    if len(store.touched_rows):
-        raise ValueError(f"{len(store.touched_rows)} voxels wait for an update")
+    waiting = len(store.touched.rows)
+    if waiting:
+        raise ValueError(f"{waiting} voxels wait for an update")
     rows, keys = store.num_rows, sorted(tiles)
     arrays = {f"voxel/{name}": column for name, column in store.freeze().items()}
     normals = mapper._normals.normals._asdict()
@@ -87,8 +88,7 @@ def _derive(mapper: Mapper, arrays: Arrays, history: dict[str, Any]) -> None:
         {int(k): Sighting(int(a), int(b), set(robots)) for k, a, b, robots in history["seen"]}
     )
     blocks = np.arange(mapper._store.num_blocks, dtype=np.int32)
-    rows = np.arange(mapper._store.num_rows, dtype=np.int32)
-    grouped = mapper.group(blocks, blocks, rows)
+    grouped = mapper.group(blocks, blocks, mapper._store.touched)
     ids = _plane_ids(mapper, len(grouped.points.total), arrays)
     mapper._identity.restore(history["identity"], ids)
     mapper.outline(ids, grouped)

@@ -37,7 +37,7 @@ def check_invariants(mapper: Mapper) -> None:
     total = int(store.num_points(store.occupied_rows()).sum())
     stored = mapper._census._points_stored
     assert total == stored, f"voxels hold {total} points, scans brought {stored}"
-    if len(store.touched_rows):
+    if len(store.touched.rows):
         return
     check_observables(store)
     _check_normals(mapper)
@@ -247,14 +247,13 @@ def crossings(ring: NDArray[np.int32]) -> NDArray[np.int64]:
 
 def _unsettled(store: VoxelStore, anew: VoxelStore) -> None:
     """Make `anew` hold the same integers, none of them looked at yet. Shares what nobody writes."""
-    rows = store.occupied_rows()
     anew.blocks = store.blocks._replace(occupied=np.zeros_like(store.blocks.occupied))
     anew.columns = store.columns._replace(
         observable=np.zeros_like(store.columns.observable),
         flags=store.columns.flags & ~TOUCHED,
     )
     anew.num_blocks, anew.num_rows = store.num_blocks, store.num_rows
-    anew._touched_rows, anew._num_touched = rows, len(rows)
+    anew.touch_all()
 
 
 def _check_digest(mapper: Mapper) -> None:

@@ -26,7 +26,7 @@ from facet.mapping.planes import FREE, PointFit, fit_points, group_planes, tabul
 from facet.mapping.quantise import quantise
 from facet.mapping.report import MapCounts, StageReport
 from facet.mapping.settings import TICKS, MapSettings
-from facet.mapping.store import VoxelStore
+from facet.mapping.store import Touched, VoxelStore
 from facet.mapping.tiles import TileField
 from facet.mapping.witness import Witness
 from facet_protocol.messages import MapUpdate, Scan, TilePoints
@@ -108,7 +108,7 @@ class Mapper:
         """Derive everything that is stale. `timer` is told the name of each stage as it ends."""
         done = timer or (lambda stage: None)
         store = self._store
-        touched = store.touched_rows.copy()
+        touched = store.touched
         dirty = store.settle()
         done("settle")
         num_stale, turned = self._normals.update(store, dirty)
@@ -118,7 +118,7 @@ class Mapper:
         lineage = self._identity.assign(len(grouped.points.total), self._heritage())
         updated = self.outline(lineage.ids, grouped, done)
         self.work = {
-            "touched_voxels": len(touched),
+            "touched_voxels": len(touched.rows),
             "dirty_voxels": len(dirty),
             "stale_voxels": num_stale,
             "blocks_regrouped": len(grouped.regrouped),
@@ -145,13 +145,13 @@ class Mapper:
         self,
         turned: NDArray[np.int32],
         moved: NDArray[np.int32],
-        touched: NDArray[np.int32],
+        touched: Touched,
         done: Timer = lambda stage: None,
     ) -> Grouped:
         """Planes from normals: group again what blocks with changed normals (`turned`), changed
-        centroids (`moved`) and rows with changed moments (`touched`) make stale."""
-        regrouped, relabelled, summed = self._patches.update(
-            self._store, self._normals.normals, turned, touched
+        centroids (`moved`) and voxels with changed moments (`touched`) make stale."""
+        regrouped, relabelled = self._patches.update(
+            self._store, self._normals.normals, turned, touched.rows
         )
         done("patches")
         limit = limits(self.settings, self._patches.sigma() / TICKS)
@@ -162,8 +162,9 @@ class Mapper:
             limit,
             regrouped,
             relabelled,
-            summed,
+            turned,
             moved,
+            touched,
         )
         done("tiles")
         self._table = tabulate(self._tiles.tiles)

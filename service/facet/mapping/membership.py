@@ -197,3 +197,36 @@ def _add(rows, columns, places, state, points):  # type: ignore[no-untyped-def]
         elif state[m] == MIXED:
             total += count_points(columns, rows[m])
     return total
+
+
+@kernel
+def add_changes(  # type: ignore[no-untyped-def]
+    rows, before, first, blocks, columns, border, patches, plane_of_patch, tile_keys, nodes, points,
+    total
+):  # fmt: skip
+    """Add to `sum_points` of T tile-planes what came to their members `rows` (R,) since they had
+    the sums `before` (R, SUMS). All else must be as it was then.
+
+    first: (B,) of the tile-planes, that of a block's tile which comes first, -1: none of these."""
+    normals = np.empty((total.shape[0], 4))
+    for t in range(total.shape[0]):
+        nx, ny, nz, offset = _seen_from(nodes, t, tile_keys[t])
+        normals[t, 0], normals[t, 1], normals[t, 2], normals[t, 3] = nx, ny, nz, offset
+    places, state = np.empty((1, 3), np.int64), np.empty(1, np.int8)
+    sums, corner = np.empty(SUMS, np.int64), np.zeros(1, np.bool_)
+    for q in range(rows.shape[0]):
+        block, label = columns.block[rows[q]], patches.label[rows[q]]
+        if label < 0:
+            continue
+        other = block if label >> 4 == CENTRE else blocks.neighbours[block, label >> 4]
+        if first[other] < 0:
+            continue
+        t = first[other] + plane_of_patch[other, label & 15]
+        plane = normals[t, 0], normals[t, 1], normals[t, 2], normals[t, 3]
+        own = rows[q : q + 1], corner
+        _look(own, blocks, columns, border, patches.second, tile_keys[t], plane, places, state)
+        read_sums(columns, rows[q], sums)
+        sums -= before[q]
+        total[t] += sums[0]
+        if state[0] == PURE:
+            shift_moments(sums, places[0, 0], places[0, 1], places[0, 2], points[t])

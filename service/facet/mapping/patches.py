@@ -326,11 +326,11 @@ class PatchField:
         normals: Normals,
         dirty: NDArray[np.int32],
         touched_rows: NDArray[np.int32],
-    ) -> tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]:
+    ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Group the blocks `dirty` again (normals or observables changed) and sum the points of
         the blocks of `touched_rows`.
 
-        Returns blocks: (patches changed), (labels changed), (point moments changed)."""
+        Returns blocks: (patches changed), (labels changed)."""
         self._fit(store)
         block_of = store.columns.block
         changed = np.empty(len(dirty), np.bool_)
@@ -349,7 +349,7 @@ class PatchField:
         relabelled_blocks = near[relabelled]
         touched = np.union1d(block_of[touched_rows], np.union1d(dirty, relabelled_blocks))
         self._sum(store, normals, touched)
-        return regrouped, relabelled_blocks, touched
+        return regrouped, relabelled_blocks
 
     def _sum(self, store: VoxelStore, normals: Normals, which: NDArray[np.int32]) -> None:
         """Point moments and rungs of the blocks `which`, and what they change of the histogram."""

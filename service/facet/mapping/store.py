@@ -33,6 +33,13 @@ from facet.mapping.sums import (
 SETTLED = 64  # from so many points on a centroid is rounded to 1/4 voxel: it moves half as often
 
 
+class Touched(NamedTuple):
+    """Voxels that points came to, or left."""
+
+    rows: NDArray[np.int32]  # (T,)
+    before: NDArray[np.int64]  # (T, SUMS) their sums when they were last settled
+
+
 class Columns(NamedTuple):
     """The voxels as columns, by row (V,); capacity V."""
 
@@ -47,9 +54,10 @@ class Columns(NamedTuple):
 
 
 @kernel
-def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched_rows):  # type: ignore[no-untyped-def]
-    """Add points from `start` on with `sign`. Returns (next point, what is used now: blocks, ...);
-    next < N means that a capacity ran out and the caller must grow and go on."""
+def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched_rows, before):  # type: ignore[no-untyped-def]
+    """Add points from `start` on with `sign`; note the rows touched, and their sums before. Returns
+    (next point, what is used now: blocks, ...); next < N means that a capacity ran out and the
+    caller must grow and go on."""
     num_blocks, num_lines, num_rows, num_touched = used
     last_key = -1
     last_block = -1
@@ -81,6 +89,7 @@ def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched
         if columns.flags[row] & TOUCHED == 0:
             columns.flags[row] |= TOUCHED
             touched_rows[num_touched] = row
+            read_sums(columns, row, before[num_touched])
             num_touched += 1
         x, y, z = tx & 1023, ty & 1023, tz & 1023
         if add_point(columns.low[row], sign, x, y, z, views[p]):
@@ -220,6 +229,7 @@ class VoxelStore:
         self._grow_lines(rows)
         self.columns = grow_all(self._memory, self.columns, 0, rows)
         self._touched_rows = np.empty(4096, np.int32)
+        self._before = np.empty((4096, SUMS), np.int64)
         self._num_touched = 0
 
     def freeze(self) -> dict[str, NDArray[Any]]:
@@ -268,9 +278,15 @@ class VoxelStore:
         self._apply(ticks, -1)
 
     @property
-    def touched_rows(self) -> NDArray[np.int32]:
-        """(T,) rows whose moments changed since the last `settle`, a view."""
-        return self._touched_rows[: self._num_touched]
+    def touched(self) -> Touched:
+        """The voxels whose sums changed since the last `settle`: views, good until points come."""
+        return Touched(self._touched_rows[: self._num_touched], self._before[: self._num_touched])
+
+    def touch_all(self) -> None:
+        """Take all voxels for touched, as if none had been looked at."""
+        rows = self.occupied_rows()
+        self._touched_rows, self._num_touched = rows, len(rows)
+        self._before = np.zeros((len(rows), SUMS), np.int64)
 
     def settle(self) -> NDArray[np.int32]:
         """Dirty rows (D,): those whose observable changed since the last call."""
@@ -310,7 +326,7 @@ class VoxelStore:
             used = (self.num_blocks, self.num_lines, self.num_rows, self._num_touched)
             done, used = _insert(
                 self.blocks, self.columns, ticks.points, ticks.views, ticks.pose_hash, sign,
-                done, used, self._touched_rows,
+                done, used, self._touched_rows, self._before,
             )  # fmt: skip
             self.num_blocks, self.num_lines, self.num_rows, self._num_touched = used
             self._grow()
@@ -324,6 +340,7 @@ class VoxelStore:
             self.columns = grow_all(self._memory, self.columns, self.num_rows, 2 * self.num_rows)
         if self._num_touched == len(self._touched_rows):
             self._touched_rows = np.resize(self._touched_rows, 2 * self._num_touched)
+            self._before = np.resize(self._before, (2 * self._num_touched, SUMS))
 
     def _grow_blocks(self, capacity: int) -> None:
         old, used = self.blocks, self.num_blocks

@@ -15,12 +15,19 @@ from numpy.typing import NDArray
 from facet.mapping.blocks import pack, pack_all, unpack, unpack_all
 from facet.mapping.growth import grow_tiles, pair_tiles
 from facet.mapping.kernel import kernel
-from facet.mapping.membership import SHELL, collect_members, find_shells, inherit, sum_points
+from facet.mapping.membership import (
+    SHELL,
+    add_changes,
+    collect_members,
+    find_shells,
+    inherit,
+    sum_points,
+)
 from facet.mapping.memory import Heap, Memory
 from facet.mapping.merging import Limits, Nodes
 from facet.mapping.normals import Normals
 from facet.mapping.patches import PER_BLOCK, PatchField
-from facet.mapping.store import VoxelStore
+from facet.mapping.store import Touched, VoxelStore
 from facet.mapping.sums import MOMENTS
 
 SHARES = 16  # parts that members are dealt out in; threads take them
@@ -101,11 +108,12 @@ class TileField:
         limits: Limits,
         regrouped: NDArray[np.int32],
         relabelled: NDArray[np.int32],
-        summed: NDArray[np.int32],
-        dirty: NDArray[np.int32],
+        turned: NDArray[np.int32],
+        moved: NDArray[np.int32],
+        touched: Touched,
     ) -> tuple[list[int], list[int]]:
-        """Bring the tiles up to date. All arguments after `limits` are blocks: patches changed,
-        labels changed, point moments changed, centroids changed.
+        """Bring the tiles up to date. The arguments after `limits` are blocks: patches changed,
+        labels changed, normals or centroids changed, centroids changed; and voxels.
 
         Returns tile keys: (tile-planes grown again, voxels of tile-planes changed)."""
         self._admit(store)
@@ -116,12 +124,14 @@ class TileField:
         else:
             regroup = [int(k) for k in np.unique(tile_keys_of(keys[regrouped]))]
         self._grow(store, patches, regroup, limits)
-        moved = np.unique(np.concatenate([regrouped, relabelled, dirty]))
-        stale = spread(np.array(regroup, np.int64), keys[moved])
+        others = np.unique(np.concatenate([regrouped, relabelled, moved]))
+        stale = spread(np.array(regroup, np.int64), keys[others])
         changed = [int(k) for k in stale if int(k) in self.tiles]
         self._fill(store, patches, changed)
-        near = np.union1d(changed, spread(np.zeros(0, np.int64), keys[summed])).tolist()
-        self._sum(store, normals, patches, [int(k) for k in near if int(k) in self.tiles])
+        anew = {*changed, *spread(_NO_KEYS, keys[turned]).tolist()} & self.tiles.keys()
+        self._sum(store, normals, patches, sorted(anew))
+        near = spread(_NO_KEYS, keys[np.unique(store.columns.block[touched.rows])]).tolist()
+        self._add(store, normals, patches, sorted(self.tiles.keys() & set(near) - anew), touched)
         self._pair(store, patches, self._beside(regroup))
         return regroup, changed
 
@@ -236,22 +246,43 @@ class TileField:
         tiles = [self.tiles[key] for key in keys]
         if not tiles:
             return
-        own = _starts([tile.num_planes for tile in tiles])
+        tile_keys, nodes = _joined(tiles)
         starts = _starts(np.concatenate([np.diff(tile.starts) for tile in tiles]))
-        points = np.empty((int(own[-1]), MOMENTS), np.int64)
+        points = np.empty((len(tile_keys), MOMENTS), np.int64)
         total = np.empty(len(points), np.int64)
         shares = np.searchsorted(starts, np.linspace(0, starts[-1], SHARES + 1))
         shares[-1] = len(points)
         sum_points(
             np.concatenate([tile.rows for tile in tiles]),
             np.concatenate([tile.corner for tile in tiles]),
-            starts, np.repeat([tile.key for tile in tiles], np.diff(own)), shares, store.blocks,
-            store.columns, normals.border, patches.patches.second,
-            Nodes(*(np.concatenate(c) for c in zip(*(t.nodes for t in tiles), strict=True))),
-            points, total,
+            starts, tile_keys, shares, store.blocks, store.columns, normals.border,
+            patches.patches.second, nodes, points, total,
         )  # fmt: skip
-        for tile, low, high in zip(tiles, own[:-1].tolist(), own[1:].tolist(), strict=True):
-            tile.points, tile.total = points[low:high].copy(), total[low:high].copy()
+        _hand_out(tiles, points, total)
+
+    def _add(
+        self,
+        store: VoxelStore,
+        normals: Normals,
+        patches: PatchField,
+        keys: list[int],
+        touched: Touched,
+    ) -> None:
+        """Add what came to the voxels of tiles where nothing else changed."""
+        tiles = [self.tiles[key] for key in keys]
+        if not tiles:
+            return
+        tile_keys, nodes = _joined(tiles)
+        first = np.full(store.num_blocks, -1, np.int32)
+        for tile, start in zip(tiles, np.searchsorted(tile_keys, keys).tolist(), strict=True):
+            first[tile.blocks] = start
+        points = np.concatenate([tile.points for tile in tiles])
+        total = np.concatenate([tile.total for tile in tiles])
+        add_changes(
+            touched.rows, touched.before, first, store.blocks, store.columns, normals.border,
+            patches.patches, self.plane_of_patch, tile_keys, nodes, points, total,
+        )  # fmt: skip
+        _hand_out(tiles, points, total)
 
     def _beside(self, keys: list[int]) -> list[int]:
         """The tiles and their 26 neighbours, as far as they exist, ascending."""
@@ -286,7 +317,21 @@ def _starts(sizes: Any) -> NDArray[np.int64]:
     return np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)]).astype(np.int64)
 
 
-_NO_ROWS = np.zeros(0, np.int32)
+def _joined(tiles: list[Tile]) -> tuple[NDArray[np.int64], Nodes]:
+    """The tile-planes of tiles, one after another: keys of their tiles (T,), and statistics."""
+    sizes = [tile.num_planes for tile in tiles]
+    nodes = Nodes(*(np.concatenate(c) for c in zip(*(t.nodes for t in tiles), strict=True)))
+    return np.repeat(np.array([tile.key for tile in tiles], np.int64), sizes), nodes
+
+
+def _hand_out(tiles: list[Tile], points: NDArray[np.int64], total: NDArray[np.int64]) -> None:
+    """Give tiles the sums of their tile-planes."""
+    ends = np.cumsum([tile.num_planes for tile in tiles]).tolist()
+    for tile, low, high in zip(tiles, [0, *ends], ends, strict=False):
+        tile.points, tile.total = points[low:high].copy(), total[low:high].copy()
+
+
+_NO_ROWS, _NO_KEYS = np.zeros(0, np.int32), np.zeros(0, np.int64)
 
 
 def _empty_tile(key: int, blocks: NDArray[np.int32]) -> Tile:
