@@ -31,13 +31,15 @@ from facet.mapping.sums import (
 )
 
 SETTLED = 64  # from so many points on a centroid is rounded to 1/4 voxel: it moves half as often
+NOTED = 1 << 16  # touched voxels whose sums before are noted: more come in no few scans
 
 
 class Touched(NamedTuple):
     """Voxels that points came to, or left."""
 
     rows: NDArray[np.int32]  # (T,)
-    before: NDArray[np.int64]  # (T, SUMS) their sums when they were last settled
+    before: NDArray[np.int64] | None  # (T, SUMS) their sums when they were last settled; None:
+    # there are too many to note
 
 
 class Columns(NamedTuple):
@@ -89,7 +91,8 @@ def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched
         if columns.flags[row] & TOUCHED == 0:
             columns.flags[row] |= TOUCHED
             touched_rows[num_touched] = row
-            read_sums(columns, row, before[num_touched])
+            if num_touched < before.shape[0]:
+                read_sums(columns, row, before[num_touched])
             num_touched += 1
         x, y, z = tx & 1023, ty & 1023, tz & 1023
         if add_point(columns.low[row], sign, x, y, z, views[p]):
@@ -229,7 +232,7 @@ class VoxelStore:
         self._grow_lines(rows)
         self.columns = grow_all(self._memory, self.columns, 0, rows)
         self._touched_rows = np.empty(4096, np.int32)
-        self._before = np.empty((4096, SUMS), np.int64)
+        self._before = np.empty((NOTED, SUMS), np.int64)
         self._num_touched = 0
 
     def freeze(self) -> dict[str, NDArray[Any]]:
@@ -280,13 +283,14 @@ class VoxelStore:
     @property
     def touched(self) -> Touched:
         """The voxels whose sums changed since the last `settle`: views, good until points come."""
-        return Touched(self._touched_rows[: self._num_touched], self._before[: self._num_touched])
+        count = self._num_touched
+        return Touched(self._touched_rows[:count], self._before[:count] if count <= NOTED else None)
 
     def touch_all(self) -> None:
         """Take all voxels for touched, as if none had been looked at."""
         rows = self.occupied_rows()
         self._touched_rows, self._num_touched = rows, len(rows)
-        self._before = np.zeros((len(rows), SUMS), np.int64)
+        self._before[:] = 0
 
     def settle(self) -> NDArray[np.int32]:
         """Dirty rows (D,): those whose observable changed since the last call."""
@@ -340,7 +344,6 @@ class VoxelStore:
             self.columns = grow_all(self._memory, self.columns, self.num_rows, 2 * self.num_rows)
         if self._num_touched == len(self._touched_rows):
             self._touched_rows = np.resize(self._touched_rows, 2 * self._num_touched)
-            self._before = np.resize(self._before, (2 * self._num_touched, SUMS))
 
     def _grow_blocks(self, capacity: int) -> None:
         old, used = self.blocks, self.num_blocks

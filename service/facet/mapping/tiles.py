@@ -128,10 +128,10 @@ class TileField:
         stale = spread(np.array(regroup, np.int64), keys[others])
         changed = [int(k) for k in stale if int(k) in self.tiles]
         self._fill(store, patches, changed)
-        anew = {*changed, *spread(_NO_KEYS, keys[turned]).tolist()} & self.tiles.keys()
+        near = self._near(keys[np.unique(store.columns.block[touched.rows])])
+        anew = {*changed, *(near if touched.before is None else self._near(keys[turned]))}
         self._sum(store, normals, patches, sorted(anew))
-        near = spread(_NO_KEYS, keys[np.unique(store.columns.block[touched.rows])]).tolist()
-        self._add(store, normals, patches, sorted(self.tiles.keys() & set(near) - anew), touched)
+        self._add(store, normals, patches, sorted(near - anew), touched)
         self._pair(store, patches, self._beside(regroup))
         return regroup, changed
 
@@ -172,6 +172,10 @@ class TileField:
             else:
                 self.tiles[key] = _empty_tile(key, members)
         self._num_blocks = count
+
+    def _near(self, block_keys: NDArray[np.int64]) -> set[int]:
+        """Tiles that hold one of the blocks or a neighbour of one."""
+        return self.tiles.keys() & set(spread(_NO_KEYS, block_keys).tolist())
 
     def _members(self, keys: list[int]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
         """Blocks of tiles, one tile after another, and where each begins (N + 1,)."""
