@@ -58,6 +58,16 @@ def _project(rows, blocks, columns, axes, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _put(places, words, row, column, window):  # type: ignore[no-untyped-def]
+    """Copy the cells of a tile that begins at (row, column) of a window, as far as they lie in
+    it."""
+    for n in range(places.shape[0]):
+        r, c = row + (places[n] >> 6), column + (places[n] & 63)
+        if 0 <= r < window.shape[0] and 0 <= c < window.shape[1]:
+            window[r, c] = words[n]
+
+
+@kernel
 def _share(uv, points, corner, places):  # type: ignore[no-untyped-def]
     """Points (N, 2) from their least corner, given as (N, 2) uv, and the (u, v) tiles that they
     fall into, as tile_u * 2^32 + tile_v, each once. Returns how many tiles."""
@@ -107,6 +117,13 @@ def _paint(points, corner, tile_u, tile_v, cells):  # type: ignore[no-untyped-de
             cells[v >> 3, u >> 3] |= bit
 
 
+class Cells(NamedTuple):
+    """The cells of a (u, v) tile that hold points."""
+
+    places: NDArray[np.int16]  # (N,) column + CELLS * row, ascending
+    words: NDArray[np.uint64]  # (N,) a bit u + 8 v for each grid point
+
+
 class Share(NamedTuple):
     """What one tile-plane gives to its plane's outline."""
 
@@ -122,7 +139,7 @@ class Contour:
     rounded: UnitNormal
     frame: PlaneFrame
     shares: dict[tuple[int, int], Share] = field(default_factory=dict)  # by (tile key, tile-plane)
-    cells: dict[Place, NDArray[np.uint64]] = field(default_factory=dict)
+    cells: dict[Place, Cells] = field(default_factory=dict)
     edges: dict[Place, NDArray[np.int32]] = field(default_factory=dict)
     outlines: list[Outline] = field(default_factory=list)
 
@@ -242,11 +259,12 @@ class ContourField:
             if place in share.places:
                 _paint(share.points, share.corner, place[0], place[1], cells)
                 drawn = True
-        old = contour.cells.get(place, _NOTHING)
+        old = np.zeros((CELLS, CELLS), np.uint64)
+        if place in contour.cells:
+            _put(*contour.cells.pop(place), 0, 0, old)
         if drawn:
-            contour.cells[place] = cells
-        else:
-            contour.cells.pop(place, None)
+            filled = np.flatnonzero(cells)
+            contour.cells[place] = Cells(filled.astype(np.int16), cells.ravel()[filled])
         marked = np.zeros((SIDE, SIDE), np.bool_)
         if not mark_changes(old, cells, marked):
             return
@@ -283,11 +301,11 @@ class ContourField:
     @staticmethod
     def _fill(window: NDArray[np.uint64], contour: Contour, place: Place) -> None:
         """Copy a tile and its halo into a window."""
-        for b, rows, own_rows in _PARTS:
-            for a, columns, own_columns in _PARTS:
+        for b in (-1, 0, 1):
+            for a in (-1, 0, 1):
                 cells = contour.cells.get((place[0] + a, place[1] + b))
                 if cells is not None:
-                    window[rows, columns] = cells[own_rows, own_columns]
+                    _put(*cells, HALO + CELLS * b, HALO + CELLS * a, window)
 
 
 def _places(keys: list[int]) -> frozenset[Place]:
@@ -306,7 +324,6 @@ def _exchange(
 
 
 _HALF = 1 << 31
-_NOTHING = np.zeros((CELLS, CELLS), np.uint64)
 _NO_EDGES = np.zeros((0, 4), np.int32)
 _PARTS = (  # of a window: which tile, where in the window, and where in that tile
     (-1, slice(0, HALO), slice(CELLS - HALO, CELLS)),

@@ -147,19 +147,14 @@ def _pairs(blocks, patches, plane_of_patch, tile_key, which, out):  # type: igno
 
 @kernel(parallel=True)
 def pair_tiles(blocks, patches, plane_of_patch, members, member_starts, tile_keys, pairs, counts):  # type: ignore[no-untyped-def]
-    """Adjacent tile-planes of tiles as `Tile.pairs`, into pairs (N, ROOM, 3); counts (N,), -1 where
+    """Adjacent tile-planes of tiles as `Tile.pairs`, into pairs (N, ROOM); counts (N,), -1 where
     the room is too short."""
     for n in prange(tile_keys.shape[0]):
         which = members[member_starts[n] : member_starts[n + 1]]
         found = np.empty(pairs.shape[1], np.int64)
         count = _pairs(blocks, patches, plane_of_patch, tile_keys[n], which, found)
         counts[n] = count
-        if count <= 0:
-            continue
-        ti, tj, tk = unpack(tile_keys[n])
-        own = np.unique(found[:count])
-        counts[n] = own.shape[0]
-        for q in range(own.shape[0]):
-            place = (own[q] >> 16) & 0xFFFF
-            other = pack(ti + place % 3 - 1, tj + (place // 3) % 3 - 1, tk + place // 9 - 1)
-            pairs[n, q, 0], pairs[n, q, 1], pairs[n, q, 2] = own[q] >> 32, other, own[q] & 0xFFFF
+        if count > 0:
+            own = np.unique(found[:count])
+            counts[n] = own.shape[0]
+            pairs[n, : own.shape[0]] = own

@@ -18,7 +18,7 @@ from facet.mapping.blocks import unpack_all
 from facet.mapping.kernel import kernel
 from facet.mapping.merging import Limits, Nodes, merge_nodes, plane_of, pool
 from facet.mapping.settings import TICKS, TILE, MapSettings
-from facet.mapping.tiles import Tile
+from facet.mapping.tiles import Tile, ends_of
 
 FREE = -1
 ENOUGH_POINTS = 200  # pure points that a plane is fitted to
@@ -78,8 +78,9 @@ def tabulate(tiles: dict[int, Tile]) -> Table:
         pairs, points = empty.reshape(0, 2), np.zeros((0, 10), np.int64)
         return Table(keys, starts, none, empty, pairs, points, empty, empty)
     nodes = Nodes(*(np.concatenate(c) for c in zip(*(t.nodes for t in ordered), strict=True)))
-    pairs = np.concatenate([t.pairs for t in ordered])
-    own = np.repeat(starts[:-1], [len(t.pairs) for t in ordered]) + pairs[:, 0]
+    of = np.repeat(np.arange(len(ordered)), [len(t.pairs) for t in ordered])
+    pairs = ends_of(np.concatenate([t.pairs for t in ordered]), keys[of])
+    own = starts[of] + pairs[:, 0]
     other = starts[np.searchsorted(keys, pairs[:, 1])] + pairs[:, 2]
     return Table(
         keys,

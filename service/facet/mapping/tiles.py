@@ -47,8 +47,8 @@ class Tile:
     rows: NDArray[np.int32]  # (M,) voxel rows of its tile-planes, one after another
     corner: NDArray[np.bool_]  # (M,) only a claim on a corner voxel that belongs elsewhere
     starts: NDArray[np.int64]  # (T + 1,) where the rows of each tile-plane begin
-    pairs: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 3), np.int64))
-    # pairs: (own tile-plane, key of the other tile, its tile-plane), adjacent
+    pairs: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    # pairs: adjacent tile-planes, own << 32 | place of the other tile among the 27 << 16 | other
     ids: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
     heritage: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 3), np.int64))
     # ids: (T,) at the last update; heritage: (plane id then, tile-plane now, voxels they share)
@@ -304,7 +304,7 @@ class TileField:
         tile_keys, counts = np.array(keys, np.int64), np.empty(len(keys), np.int64)
         room = 4096
         while True:
-            pairs = np.empty((len(keys), room, 3), np.int64)
+            pairs = np.empty((len(keys), room), np.int64)
             pair_tiles(
                 store.blocks, patches.patches, self.plane_of_patch, members, member_starts,
                 tile_keys, pairs, counts,
@@ -314,6 +314,15 @@ class TileField:
             room *= 4
         for key, own, count in zip(keys, pairs, counts.tolist(), strict=True):
             self.tiles[key].pairs = own[:count].copy()
+
+
+def ends_of(pairs: NDArray[np.int64], tile_keys: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(P, 3) own tile-plane, key of the other tile and its tile-plane, of the pairs (P,) of tiles
+    with these keys (P,)."""
+    place = (pairs >> 16) & 0xFFFF
+    offset = np.stack([place % 3, (place // 3) % 3, place // 9], axis=1) - 1
+    other = pack_all(unpack_all(tile_keys) + offset)
+    return np.stack([pairs >> 32, other, pairs & 0xFFFF], axis=1)
 
 
 def _starts(sizes: Any) -> NDArray[np.int64]:
