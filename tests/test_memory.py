@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Iterator
 from dataclasses import fields, is_dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from facet.mapping.mapper import Mapper
@@ -93,3 +97,30 @@ def test_the_same_loop_again_and_again_grows_nothing() -> None:
     assert mapper._store.num_rows == rows
     assert column_bytes(mapper) == columns
     assert last < SHIFTS * first
+
+
+GROWS = """
+import gc, sys
+from benchmarks import buildings, growth, inside
+from facet.mapping.mapper import Mapper
+
+mapper, looks = Mapper(), buildings.office(100)
+sources, rows = growth.all_copies(looks), []
+for mark in (300_000, 600_000, 900_000, 1_200_000):
+    growth.grow(mapper, mark, looks, sources)
+    mapper.update()
+    gc.collect()
+    rows.append((inside.num_voxels(mapper), inside.rss_bytes() - inside.free_bytes(mapper)))
+print(*(n for row in rows for n in row))
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="resident memory is read from /proc")
+def test_a_voxel_takes_no_more_than_160_bytes() -> None:
+    """All derived, free space apart; a process of its own, which nothing else has filled."""
+    child = subprocess.run(
+        [sys.executable, "-c", GROWS], cwd=Path(__file__).parent, capture_output=True, text=True
+    )
+    assert child.returncode == 0, child.stderr
+    voxels, resident = np.array(child.stdout.split(), float).reshape(-1, 2).T
+    assert np.polyfit(voxels, resident, 1)[0] <= 160.0
