@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import itertools
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numba import njit
 
-from facet.mapping.bits import box_mask, trailing_zeros
+from facet.mapping.bits import population, trailing_zeros
 
 
 @njit
@@ -21,15 +19,19 @@ def set_bits(word: np.uint64) -> list[int]:
     return out
 
 
-def test_every_box_of_an_8_by_8_slice() -> None:
-    sides = [(a, b) for a in range(8) for b in range(a, 8)]
-    for (x0, x1), (y0, y1) in itertools.product(sides, sides):
-        plain = sum(1 << (x + 8 * y) for x in range(x0, x1 + 1) for y in range(y0, y1 + 1))
-        assert int(box_mask(x0, x1, y0, y1)) == plain
-
-
 @settings(deadline=None)
 @given(st.integers(1, 2**64 - 1))
 def test_bits_are_found_lowest_first(word: int) -> None:
     expected = [b for b in range(64) if word >> b & 1]
     assert list(set_bits(np.uint64(word))) == expected
+
+
+@njit
+def number_of_bits(word: np.uint64) -> int:
+    return np.int64(population(word))
+
+
+@settings(deadline=None)
+@given(st.integers(0, 2**64 - 1))
+def test_bits_are_counted(word: int) -> None:
+    assert number_of_bits(np.uint64(word)) == word.bit_count()

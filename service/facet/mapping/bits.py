@@ -4,12 +4,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numpy as np
 from llvmlite import ir
 from numba import types
 from numba.extending import intrinsic
-
-from facet.mapping.kernel import kernel
 
 
 def _trailing_zeros(typingctx: Any, word: Any) -> Any:
@@ -38,13 +35,3 @@ def _population(typingctx: Any, word: Any) -> Any:
 
 
 population: Any = intrinsic(_population)
-
-
-@kernel
-def box_mask(x0: int, x1: int, y0: int, y1: int) -> np.uint64:
-    """Bits x + 8 y with x0 <= x <= x1 and y0 <= y <= y1 (all 0..7)."""
-    row = (np.uint64(1) << np.uint64(x1 + 1)) - (np.uint64(1) << np.uint64(x0))
-    high = np.uint64(8 * y1 + 8)
-    below_high = ~np.uint64(0) if high == np.uint64(64) else (np.uint64(1) << high) - np.uint64(1)
-    below_low = (np.uint64(1) << np.uint64(8 * y0)) - np.uint64(1)
-    return row * np.uint64(0x0101010101010101) & (below_high & ~below_low)
