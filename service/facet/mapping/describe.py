@@ -31,8 +31,29 @@ class Figures(NamedTuple):
     sighting: Sighting
 
 
+class Told(NamedTuple):
+    """The figures of an update, and what they were made of."""
+
+    ids: NDArray[np.int64]  # (K,)
+    data: NDArray[np.float64]  # (K, ...)
+    figures: dict[int, Figures]  # by plane id
+
+    @classmethod
+    def nothing(cls) -> Told:
+        return cls(np.zeros(0, np.int64), np.zeros((0, 1)), {})
+
+    def differ(self, ids: NDArray[np.int64], data: NDArray[np.float64]) -> NDArray[np.bool_]:
+        """(K,) whether the planes of these ids were not there, or made of other data."""
+        different = np.ones(len(ids), np.bool_)
+        _, now, before = np.intersect1d(ids, self.ids, assume_unique=True, return_indices=True)
+        if len(now):
+            different[now] = np.any(data[now] != self.data[before], axis=1)
+        return different
+
+
 @dataclass(slots=True)
 class _Entry:
+    own: Figures
     key: tuple[bytes, ...]
     outlines: list[Outline]
     probes: list[list[NDArray[np.int64]]]  # by outline and hole
@@ -87,8 +108,9 @@ class Describer:
         ]
 
     def _refresh(self, plane_id: int, own: Figures, contour: Contour, free: FreeSpace) -> bool:
-        key = _key(own, contour)
         old = self._entries.get(plane_id)
+        known = old is not None and old.own is own and old.outlines is contour.outlines
+        key = old.key if known and old is not None else _key(own, contour)
         same = old is not None and old.key == key and old.outlines is contour.outlines
         found = old.probes if same and old is not None else self._probes(own.fit, contour)
         kinds = [[hole_kind(p, free, self._settings) for p in holes] for holes in found]
@@ -97,7 +119,7 @@ class Describer:
         revision = old.plane.revision + 1 if old is not None else 1
         surfaces = self._surfaces(contour, kinds, old)
         plane = _plane(plane_id, revision, own, contour, surfaces)
-        self._entries[plane_id] = _Entry(key, contour.outlines, found, kinds, plane)
+        self._entries[plane_id] = _Entry(own, key, contour.outlines, found, kinds, plane)
         return True
 
     def _probes(self, fit: Fit, contour: Contour) -> list[list[NDArray[np.int64]]]:

@@ -12,9 +12,9 @@ from facet.mapping.bends import Bends
 from facet.mapping.blocks import pack, unpack
 from facet.mapping.census import Census, tile_points
 from facet.mapping.contours import ContourField
-from facet.mapping.describe import Describer, Figures
+from facet.mapping.describe import Describer, Figures, Told
 from facet.mapping.digest import Digest, derived_digest, model_planes, state_digest
-from facet.mapping.fitting import Fit, fit_plane
+from facet.mapping.fitting import fit_plane
 from facet.mapping.freespace import FreeSpace
 from facet.mapping.identity import Heritage, Identity
 from facet.mapping.invariants import check_invariants
@@ -33,7 +33,6 @@ from facet_protocol.messages import MapUpdate, Scan, TilePoints
 
 Timer = Callable[[str], None]
 TileIndex = tuple[int, int, int]
-Members = dict[int, list[tuple[int, int]]]  # plane id: its tile-planes (tile key, number)
 
 
 class Inserted(NamedTuple):
@@ -82,7 +81,7 @@ class Mapper:
         self._describer = Describer(self.settings)
         self._witness = Witness()
         self._census = Census()
-        self._fits: dict[int, tuple[bytes, Fit]] = {}  # by plane id, with what it was made of
+        self._told = Told.nothing()
         self._table = tabulate({})
         self._planes = group_planes(self._table, limits(self.settings, 0.0), self.settings)
         self._stamp_ns = 0
@@ -177,8 +176,8 @@ class Mapper:
         self, ids: NDArray[np.int64], grouped: Grouped, done: Timer = lambda stage: None
     ) -> list[int]:
         """Figures and outlines of the planes, under their ids (K,). Returns those that changed."""
-        members, renamed = self._name(ids)
-        figures = self._figures(ids, grouped.points, members)
+        renamed = self._name(ids)
+        figures = self._figures(ids, grouped.points)
         done("identity")
         self._contours.update(
             self._store, self._tiles.tiles, {*grouped.changed, *renamed},
@@ -250,52 +249,38 @@ class Mapper:
         none = [np.zeros(0, np.int64)]
         return Heritage(*(np.concatenate(none + part) for part in (old, plane, voxels)))
 
-    def _name(self, ids: NDArray[np.int64]) -> tuple[Members, list[int]]:
-        """Hand the plane ids to the tiles. Returns each plane's tile-planes, and renamed tiles."""
-        label, table = self._planes.label, self._table
+    def _name(self, ids: NDArray[np.int64]) -> list[int]:
+        """Hand the plane ids to the tiles. Returns the tiles that were renamed."""
+        label = self._planes.label
         named = np.where(label == FREE, 0, ids[label] if len(ids) else 0)
-        renamed = self._tiles.name(table.tile_keys, table.starts, named)
-        numbers = np.arange(len(label)) - table.starts[table.tile_of]
-        order = np.argsort(label, kind="stable")
-        order = order[np.searchsorted(label[order], 0) :]  # FREE is less
-        keys = table.tile_keys[table.tile_of[order]]
-        pairs = list(zip(keys.tolist(), numbers[order].tolist(), strict=True))
-        ends = np.cumsum(np.bincount(label[order], minlength=len(ids))).tolist()
-        starts = [0, *ends][: len(ends)]
-        members = {int(i): pairs[low:high] for i, low, high in zip(ids, starts, ends, strict=True)}
-        return members, renamed
+        return self._tiles.name(self._table.tile_keys, self._table.starts, named)
 
-    def _figures(
-        self, ids: NDArray[np.int64], points: PointFit, members: Members
-    ) -> dict[int, Figures]:
+    def _figures(self, ids: NDArray[np.int64], points: PointFit) -> dict[int, Figures]:
+        """Figures of the planes: anew of those that changed, or were seen again."""
+        planes, told = self._planes, self._told
+        unit = planes.nodes.unit
+        data = np.column_stack(
+            [points.total, planes.occupation, points.weight, points.centroid, points.scatter, unit]
+        )
+        again = told.differ(ids, data)
+        again[self._seen_planes()] = True
         figures = {}
-        for gone in self._fits.keys() - set(ids.tolist()):
-            del self._fits[gone]
         for plane, plane_id in enumerate(ids.tolist()):
-            total, centroid = int(points.total[plane]), points.centroid[plane]
-            unit = self._planes.nodes.unit[plane]
-            fit = self._fit(
-                plane_id, float(points.weight[plane]), centroid, points.scatter[plane], unit
-            )
-            seen = self._witness.of({key for key, _ in members[plane_id]})
-            voxels = int(self._planes.occupation[plane])
+            if not again[plane]:
+                figures[plane_id] = told.figures[plane_id]
+                continue
+            centroid, scatter = points.centroid[plane], points.scatter[plane]
+            weight = float(points.weight[plane])
+            fit = fit_plane(weight, centroid, scatter, unit[plane], self.settings.tick_m)
+            own = np.unique(self._table.tile_of[planes.label == plane])
+            seen = self._witness.of(self._table.tile_keys[own].tolist())
+            total, voxels = int(points.total[plane]), int(planes.occupation[plane])
             figures[plane_id] = Figures(fit, total, voxels, centroid, seen)
+        self._told = Told(ids, data, figures)
         return figures
 
-    def _fit(
-        self,
-        plane_id: int,
-        weight: float,
-        centroid: NDArray[np.float64],
-        scatter: NDArray[np.float64],
-        unit: NDArray[np.float64],
-    ) -> Fit:
-        """`fit_plane`, or what it said last time if it was asked the same."""
-        key = b"".join(
-            [np.float64(weight).tobytes(), *(c.tobytes() for c in (centroid, scatter, unit))]
-        )
-        known = self._fits.get(plane_id)
-        if known is None or known[0] != key:
-            known = key, fit_plane(weight, centroid, scatter, unit, self.settings.tick_m)
-        self._fits[plane_id] = known
-        return known[1]
+    def _seen_planes(self) -> NDArray[np.int64]:
+        """Planes in tiles that were seen since the last update."""
+        seen = np.isin(self._table.tile_keys, self._witness.fresh())
+        label = self._planes.label[seen[self._table.tile_of]]
+        return np.unique(label[label != FREE])

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from facet.mapping.blocks import pack
 from facet.mapping.kernel import kernel
@@ -40,10 +41,13 @@ class Witness:
 
     def __init__(self) -> None:
         self._sightings: dict[int, Sighting] = {}
+        self._fresh: set[int] = set()
 
     def note(self, ticks: Ticks, scan: Scan) -> None:
         """A scan saw the tiles of its points."""
-        for key in np.unique(_tile_runs(ticks.points)).tolist():
+        keys = np.unique(_tile_runs(ticks.points)).tolist()
+        self._fresh.update(keys)
+        for key in keys:
             seen = self._sightings.get(key)
             if seen is None:
                 self._sightings[key] = Sighting(scan.stamp_ns, scan.stamp_ns, {scan.robot})
@@ -51,6 +55,12 @@ class Witness:
             seen.first_ns = min(seen.first_ns, scan.stamp_ns)
             seen.last_ns = max(seen.last_ns, scan.stamp_ns)
             seen.robots.add(scan.robot)
+
+    def fresh(self) -> NDArray[np.int64]:
+        """Tiles that were seen since it was asked this last."""
+        keys = np.array(sorted(self._fresh), np.int64)
+        self._fresh.clear()
+        return keys
 
     def items(self) -> list[tuple[int, Sighting]]:
         """Sightings by tile, ascending."""
