@@ -1,10 +1,15 @@
 """Planes that are none: strips too narrow to have a normal, and strips of something curved.
 
 On a plane the members' normals do not depend on where they are; along a curved wall, or over a
-bevelled edge, they turn steadily. Whatever turns goes to the remainder (design 3.4).
+bevelled edge, they turn steadily. Whatever turns goes to the remainder (design 3.4). At the edges
+of a narrow plane points of the faces beyond turn the normals as well, so where a narrow strip has
+members enough it is bent only if they lie on an arc too, which turns the same way.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,26 +25,44 @@ from facet.mapping.store import VoxelStore
 from facet.mapping.tiles import TileField
 
 SUMS = 22  # n; sum x (3), xx (6); sum u (3), u x (9): x in 1/8 voxels, u normals times UNIT
+ARC = 9  # n; sum s, ss, sss, ssss, h, hh, hs, hss: 1/8 voxels across, 1/64 voxels off the plane
+ARC_WIDTH = 10.0  # voxels: a narrower strip
+ARC_VOTES = 200  # of so many members at least must lie on an arc to be bent,
+ARC_NORMALS_DEG = 8.5  # whose normals turn by so much,
+ARC_DEG = 5.0  # and which turns by so much itself,
+ARC_SIGMAS = 3.5  # and surely
 
 
 @kernel
-def _add_members(store, normals, patches, rows, corner, starts, plane_of, origin, sums):  # type: ignore[no-untyped-def]
-    """Add a tile's pure members to the sums (K, SUMS) of their planes; plane_of (T,), -1: none."""
+def _is_pure(normals, patches, row):  # type: ignore[no-untyped-def]
+    """Whether a voxel has a normal that no other surface turned."""
+    return patches.member[row] >= 0 and not normals.border[row] and patches.second[row] < 0
+
+
+@kernel
+def _place(store, row, origin, x):  # type: ignore[no-untyped-def]
+    """A voxel's rounded centroid from an origin, 1/8 voxels, into x (3,)."""
     blocks, columns = store
+    seen, local = columns.observable[row], np.int64(columns.local[row])
+    bi, bj, bk = unpack(blocks.keys[columns.block[row]])
+    x[0] = STEPS * (8 * bi + (local & 7)) + (seen & 15) - origin[0]
+    x[1] = STEPS * (8 * bj + ((local >> 3) & 7)) + ((seen >> 4) & 15) - origin[1]
+    x[2] = STEPS * (8 * bk + (local >> 6)) + ((seen >> 8) & 15) - origin[2]
+
+
+@kernel
+def _add_members(store, normals, patches, members, plane_of, origin, sums):  # type: ignore[no-untyped-def]
+    """Add a tile's pure members (rows, corner, starts) to the sums (K, SUMS) of their planes;
+    plane_of (T,), -1: none."""
+    rows, corner, starts = members
     x = np.empty(3, np.int64)
     for plane in range(plane_of.shape[0]):
         k = plane_of[plane]
         for m in range(starts[plane], starts[plane + 1] if k >= 0 else 0):
             row = rows[m]
-            if corner[m] or patches.member[row] < 0 or normals.border[row]:
+            if corner[m] or not _is_pure(normals, patches, row):
                 continue
-            if patches.second[row] >= 0:
-                continue
-            seen, local = columns.observable[row], np.int64(columns.local[row])
-            bi, bj, bk = unpack(blocks.keys[columns.block[row]])
-            x[0] = STEPS * (8 * bi + (local & 7)) + (seen & 15) - origin[k, 0]
-            x[1] = STEPS * (8 * bj + ((local >> 3) & 7)) + ((seen >> 4) & 15) - origin[k, 1]
-            x[2] = STEPS * (8 * bk + (local >> 6)) + ((seen >> 8) & 15) - origin[k, 2]
+            _place(store, row, origin[k], x)
             sums[k, 0] += 1
             s = 4
             for a in range(3):
@@ -52,21 +75,74 @@ def _add_members(store, normals, patches, rows, corner, starts, plane_of, origin
                     sums[k, 13 + 3 * a + b] += normals.unit[row, a] * x[b]
 
 
-def _turn(own: NDArray[np.int64]) -> float:
-    """Largest angle, radians, by which the members' normals turn over the width or the length."""
+@kernel
+def _add_heights(store, normals, patches, members, plane_of, origin, axes, sums):  # type: ignore[no-untyped-def]
+    """Likewise add to sums (K, ARC) where they are across the strip, and how far off its plane.
+    axes: (K, 6) unit vectors across it and along its normal."""
+    rows, corner, starts = members
+    x = np.empty(3, np.int64)
+    for plane in range(plane_of.shape[0]):
+        k = plane_of[plane]
+        for m in range(starts[plane], starts[plane + 1] if k >= 0 else 0):
+            row = rows[m]
+            if corner[m] or not _is_pure(normals, patches, row):
+                continue
+            _place(store, row, origin[k], x)
+            u = axes[k]
+            s = np.int64(np.floor(u[0] * x[0] + u[1] * x[1] + u[2] * x[2] + 0.5))
+            h = np.int64(np.floor(8.0 * (u[3] * x[0] + u[4] * x[1] + u[5] * x[2]) + 0.5))
+            ss = s * s
+            sums[k, 0] += 1
+            sums[k, 1] += s
+            sums[k, 2] += ss
+            sums[k, 3] += ss * s
+            sums[k, 4] += ss * ss
+            sums[k, 5] += h
+            sums[k, 6] += h * h
+            sums[k, 7] += h * s
+            sums[k, 8] += h * ss
+
+
+class Turn(NamedTuple):
+    """How much the members' normals turn over one direction in a strip."""
+
+    angle: float  # radians, positive where the strip bulges
+    width: float  # voxels
+    axes: NDArray[np.float64]  # (6,) that direction, and the strip's normal
+
+
+def _turns(own: NDArray[np.int64]) -> list[Turn]:
+    """Over the width and the length, as far as there is any."""
     n = float(own[0])
     mean, unit = own[1:4] / n, own[10:13] / n / UNIT
     xx = own[4:10] / n - np.array([mean[a] * mean[b] for a in range(3) for b in range(a, 3)])
     ux = own[13:22].reshape(3, 3) / n / UNIT - np.outer(unit, mean)
-    _, _, _, _, middle, largest = smallest(xx)
-    most = 0.0
+    _, nx, ny, nz, middle, largest = smallest(xx)
+    normal = np.array([nx, ny, nz])
+    if float(normal @ unit) < 0.0:
+        normal = -normal
+    turns = []
     for variance in (middle, largest):
         if variance < 1.0:
             continue
         axis = np.array(eigenvector(xx[0], xx[3], xx[5], xx[1], xx[2], xx[4], variance))
+        width = float(np.sqrt(12.0 * variance))
         slope = float(axis @ ux @ axis) / variance
-        most = max(most, abs(slope) * float(np.sqrt(12.0 * variance)))
-    return most
+        turns.append(Turn(slope * width, width / STEPS, np.concatenate([axis, normal])))
+    return turns
+
+
+def _arc(own: NDArray[np.int64], width: float) -> tuple[float, float]:
+    """(angle, radians, by which the parabola through the members turns over the width, positive
+    where it bulges; its standard deviation)."""
+    n = float(own[0])
+    s, ss, sss, ssss, h, hh, hs, hss = own[1:] / n
+    s2, h2, hs1 = ss - s * s, hh - h * h, hs - h * s
+    s3, s4, hs2 = sss - ss * s, ssss - ss * ss, hss - h * ss
+    own_s4 = s4 - s3 * s3 / s2
+    bow = (hs2 - hs1 * s3 / s2) / own_s4
+    rest = h2 - hs1 * hs1 / s2 - bow * bow * own_s4
+    return -2.0 * bow * width, 2.0 * width * float(np.sqrt(max(rest, 0.0) / (n * own_s4)))
 
 
 class Bends:
@@ -101,32 +177,64 @@ class Bends:
         )
         wide = widths >= self._settings.min_width
         strips = wide & (widths < self._settings.strip_width)
-        sums = self._sum(tile_keys, starts, label, strips, nodes)
+        origin = np.floor(nodes.mean * STEPS).astype(np.int64)
+        sums = np.zeros((len(strips), SUMS), np.int64)
+        self._sum(_add_members, tile_keys, starts, label, strips, origin, sums)
         limit = np.radians(self._settings.bend_deg)
-        for plane in np.flatnonzero(strips & (sums[:, 0] >= self._settings.n_min)):
-            wide[plane] = _turn(sums[plane]) <= limit
+        doubtful: dict[int, Turn] = {}
+        for plane in np.flatnonzero(strips & (sums[:, 0] >= self._settings.n_min)).tolist():
+            turns = _turns(sums[plane])
+            across = turns[0]
+            if across.width < ARC_WIDTH and sums[plane, 0] >= ARC_VOTES:
+                wide[plane] = all(abs(t.angle) <= limit for t in turns[1:])
+                if wide[plane] and abs(across.angle) > np.radians(ARC_NORMALS_DEG):
+                    doubtful[plane] = across
+            else:
+                wide[plane] = all(abs(t.angle) <= limit for t in turns)
+        for plane in self._arched(tile_keys, starts, label, origin, doubtful):
+            wide[plane] = False
         return wide
 
-    def _sum(
+    def _arched(
         self,
         tile_keys: NDArray[np.int64],
         starts: NDArray[np.int64],
         label: NDArray[np.int64],
-        strips: NDArray[np.bool_],
-        nodes: Nodes,
-    ) -> NDArray[np.int64]:
-        sums = np.zeros((len(strips), SUMS), np.int64)
-        origin = np.floor(nodes.mean * STEPS).astype(np.int64)
+        origin: NDArray[np.int64],
+        turns: dict[int, Turn],
+    ) -> list[int]:
+        """Those of the planes `turns` that lie on an arc which turns as their normals do."""
+        if not turns:
+            return []
+        asked = np.isin(np.arange(len(origin)), list(turns))
+        axes, sums = np.zeros((len(origin), 6)), np.zeros((len(origin), ARC), np.int64)
+        for plane, turn in turns.items():
+            axes[plane] = turn.axes
+        self._sum(_add_heights, tile_keys, starts, label, asked, origin, axes, sums)
+        arched = []
+        for plane, turn in turns.items():
+            angle, deviation = _arc(sums[plane], turn.width)
+            least = max(np.radians(ARC_DEG), ARC_SIGMAS * deviation)
+            if angle * np.sign(turn.angle) > least:
+                arched.append(plane)
+        return arched
+
+    def _sum(
+        self,
+        add: Callable[..., None],
+        tile_keys: NDArray[np.int64],
+        starts: NDArray[np.int64],
+        label: NDArray[np.int64],
+        asked: NDArray[np.bool_],
+        *arguments: NDArray[Any],
+    ) -> None:
+        """Hand the members of the planes that are `asked` for (K,), tile by tile, to `add`."""
         wanted = np.where(label >= 0, label, 0)
-        plane_of = np.where((label >= 0) & strips[wanted], label, -1) if len(strips) else label
-        normals, patches = self._normals.normals, self._patches.patches
+        plane_of = np.where((label >= 0) & asked[wanted], label, -1) if len(asked) else label
+        store = self._store.blocks, self._store.columns
         for index, key in enumerate(tile_keys.tolist()):
             own = plane_of[starts[index] : starts[index + 1]]
-            if not (own >= 0).any():
-                continue
-            tile = self._tiles.tiles[key]
-            _add_members(
-                (self._store.blocks, self._store.columns), normals, patches, tile.rows, tile.corner,
-                tile.starts, own, origin, sums,
-            )  # fmt: skip
-        return sums
+            if (own >= 0).any():
+                tile = self._tiles.tiles[key]
+                members = tile.rows, tile.corner, tile.starts
+                add(store, self._normals.normals, self._patches.patches, members, own, *arguments)
