@@ -111,6 +111,19 @@ def _dot(normals, a, b):  # type: ignore[no-untyped-def]
 
 
 @kernel
+def _agreement(nx, ny, nz, unit):  # type: ignore[no-untyped-def]
+    """Cosine between a normal and the mean of the members' normals."""
+    length = np.sqrt(unit[0] * unit[0] + unit[1] * unit[1] + unit[2] * unit[2])
+    return (nx * unit[0] + ny * unit[1] + nz * unit[2]) / length
+
+
+@kernel
+def _mean_cos(normals, unit, a, b):  # type: ignore[no-untyped-def]
+    """Cosine between a's normal and the mean normal of b's members."""
+    return _agreement(normals[a, 0], normals[a, 1], normals[a, 2], unit[b])
+
+
+@kernel
 def edge_costs(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-def]
     """(E,) cost of merging along each edge; inf where its two ends disagree by themselves."""
     normals = np.empty((votes.shape[0], 3))
@@ -122,7 +135,7 @@ def edge_costs(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-unt
         a, b = edges[e, 0], edges[e, 1]
         if votes[b] > votes[a]:
             a, b = b, a
-        cos = _dot(normals, a, b)
+        cos = max(_dot(normals, a, b), _mean_cos(normals, unit, a, b))
         w = abs(_offset(normals, mean, a, b))
         if cos < limit.edge_cos or w > limit.offset:
             costs[e] = np.inf
@@ -142,7 +155,7 @@ def _root(parent, t):  # type: ignore[no-untyped-def]
 @kernel
 def _try(votes, mean, scatter, unit, normals, a, b, limit, m, s, u):  # type: ignore[no-untyped-def]
     """Whether a and b (a the larger) are one plane; m, s, u are then its statistics."""
-    if _dot(normals, a, b) < limit.cos:
+    if _dot(normals, a, b) < limit.cos and _mean_cos(normals, unit, a, b) < limit.cos:
         return False
     w = _offset(normals, mean, a, b)
     if abs(w) > limit.offset:
@@ -164,13 +177,6 @@ def _try(votes, mean, scatter, unit, normals, a, b, limit, m, s, u):  # type: ig
     noise = limit.tilt / np.sqrt(across) if across > 0.0 else 1.0
     allowed = np.cos(min(1.5, limit.bridge + np.arctan(noise)))
     return _agreement(nx, ny, nz, u) >= allowed
-
-
-@kernel
-def _agreement(nx, ny, nz, unit):  # type: ignore[no-untyped-def]
-    """Cosine between a normal and the mean of the members' normals."""
-    length = np.sqrt(unit[0] * unit[0] + unit[1] * unit[1] + unit[2] * unit[2])
-    return (nx * unit[0] + ny * unit[1] + nz * unit[2]) / length
 
 
 @kernel
