@@ -7,12 +7,17 @@ from numba import prange
 
 from facet.mapping.bits import population, trailing_zeros
 from facet.mapping.blocks import CENTRE, find, pack, row_at, unpack
+from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.merging import plane_of
 from facet.mapping.settings import BLOCK, STEPS, TILE
 from facet.mapping.sums import SUMS, count_points, read_sums, shift_moments
 
 STRAY = 0.47  # voxels: a voxel whose centroid is so far off its tile-plane is not fitted to
+RIMMED = (12.0, 40.0)  # voxels: a tile-plane of such a width may be tilted by its rim
+CORE = 0.3  # voxels: centroids so near say where it truly lies
+ROUNDS = 4
+FEW = 30  # voxels say nothing
 SHELL = 1000  # blocks of a tile and of the shell round it
 CHUNK = 256  # members that are looked at together
 PURE, MIXED, CLAIMED = range(3)  # what a member is to its tile-plane
@@ -129,7 +134,8 @@ def sum_points(  # type: ignore[no-untyped-def]
 ):
     """Sum the voxels' point moments about the tile's corner into points (T, 10), without those
     that hold points of others: at a border, claimed by a plane at an angle, or STRAY from their
-    tile-plane; count all in total (T,).
+    tile-plane; count all in total (T,). A tile-plane neither narrow nor wide is settled first:
+    the rim of a table's top tilts it.
 
     rows, corner: members of T tile-planes, one after another, those of t from starts[t] on;
     tile_keys: (T,); shares: (S + 1,) tile-planes that each thread begins with.
@@ -141,7 +147,10 @@ def sum_points(  # type: ignore[no-untyped-def]
         for t in range(shares[share], shares[share + 1]):
             points[t] = 0
             total[t] = 0
-            plane = _seen_from(nodes, t, tile_keys[t])
+            plane, width = _seen_from(nodes, t, tile_keys[t])
+            if RIMMED[0] <= width <= RIMMED[1]:
+                own = rows[starts[t] : starts[t + 1]], corner[starts[t] : starts[t + 1]]
+                plane = _settled(own, blocks, columns, border, second, tile_keys[t], plane)
             for start in range(starts[t], starts[t + 1], CHUNK):
                 stop = min(starts[t + 1], start + CHUNK)
                 own = rows[start:stop], corner[start:stop]
@@ -151,12 +160,51 @@ def sum_points(  # type: ignore[no-untyped-def]
 
 @kernel
 def _seen_from(nodes, t, tile_key):  # type: ignore[no-untyped-def]
-    """Unit normal of a tile-plane, and its offset from the corner of the tile, voxels."""
+    """(unit normal of a tile-plane and its offset from the corner of the tile, its width), voxels.
+    The width is 0 where it is too small to have one."""
     ti, tj, tk = unpack(tile_key)
-    nx, ny, nz, _, _ = plane_of(nodes.votes[t], nodes.scatter[t], nodes.unit[t])
+    nx, ny, nz, _, across = plane_of(nodes.votes[t], nodes.scatter[t], nodes.unit[t])
     mean = nodes.mean[t]
     offset = nx * (mean[0] - TILE * ti) + ny * (mean[1] - TILE * tj) + nz * (mean[2] - TILE * tk)
-    return nx, ny, nz, offset
+    return (nx, ny, nz, offset), np.sqrt(12.0 * max(0.0, across))
+
+
+@kernel
+def _settled(own, blocks, columns, border, second, tile_key, plane):  # type: ignore[no-untyped-def]
+    """The plane moved to where most of the members' centroids lie. A rim that tilts it, or another
+    surface close by, is left behind."""
+    rows, corner = own
+    ti, tj, tk = unpack(tile_key)
+    spread = np.empty(6)
+    for _ in range(ROUNDS):
+        nx, ny, nz, offset = plane
+        n, pure = 0, 0
+        x, y, z, xx, xy, xz, yy, yz, zz = 0, 0, 0, 0, 0, 0, 0, 0, 0
+        for m in range(rows.shape[0]):
+            row = rows[m]
+            if corner[m] or border[row] or second[row] >= 0:
+                continue
+            i, j, k = unpack(blocks.keys[columns.block[row]])
+            seen, local = columns.observable[row], np.int64(columns.local[row])
+            a = STEPS * (BLOCK * i - TILE * ti + (local & 7)) + (seen & 15)
+            b = STEPS * (BLOCK * j - TILE * tj + ((local >> 3) & 7)) + ((seen >> 4) & 15)
+            c = STEPS * (BLOCK * k - TILE * tk + (local >> 6)) + ((seen >> 8) & 15)
+            pure += 1
+            if abs((nx * a + ny * b + nz * c) / STEPS - offset) > CORE:
+                continue
+            n, x, y, z = n + 1, x + a, y + b, z + c
+            xx, xy, xz = xx + a * a, xy + a * b, xz + a * c
+            yy, yz, zz = yy + b * b, yz + b * c, zz + c * c
+        if n < FEW or 2 * n < pure:
+            break
+        mx, my, mz = x / n, y / n, z / n
+        spread[0], spread[1], spread[2] = xx - x * mx, xy - x * my, xz - x * mz
+        spread[3], spread[4], spread[5] = yy - y * my, yz - y * mz, zz - z * mz
+        _, ux, uy, uz, _, _ = smallest(spread)
+        sign = 1.0 if ux * nx + uy * ny + uz * nz > 0.0 else -1.0
+        ux, uy, uz = sign * ux, sign * uy, sign * uz
+        plane = ux, uy, uz, (ux * mx + uy * my + uz * mz) / STEPS
+    return plane
 
 
 @kernel
