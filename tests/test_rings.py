@@ -111,6 +111,43 @@ def test_an_edge_both_ways_bounds_nothing() -> None:
     assert stitch(np.zeros((0, 4), np.int64)) == []
 
 
+def gate() -> Grid:
+    """Points on a square with a door at its low side, grid units."""
+    points = lattice(0, 480)
+    return points[~((points[:, 0] > 160) & (points[:, 0] < 320) & (points[:, 1] < 320))]
+
+
+def test_a_row_of_voxels_closes_a_door() -> None:
+    (open_one,) = surfaces_of(tiled(gate()), 800.0)
+    assert open_one.holes == []
+    row = np.stack([np.arange(160, 321, 8), np.full(21, 5)], axis=1)
+    (closed,) = surfaces_of(tiled(np.concatenate([gate(), row])), 800.0)
+    (hole,) = closed.holes
+    assert signed_area(hole) == pytest.approx(-160.0 * 315.0, rel=0.12)  # less in its corners
+    assert closed.area == pytest.approx(open_one.area, rel=0.02)
+    assert len(crossings(closed.outer)) == len(crossings(hole)) == 0
+
+
+def test_points_apart_close_nothing() -> None:
+    row = np.stack([np.arange(160, 321, 32), np.full(6, 5)], axis=1)
+    (still_open,) = surfaces_of(tiled(np.concatenate([gate(), row])), 800.0)
+    assert still_open.holes == []
+
+
+def test_a_row_that_ends_bounds_nothing() -> None:
+    row = np.stack([np.full(20, 240), np.arange(488, 641, 8)], axis=1)
+    (spurred,) = surfaces_of(tiled(np.concatenate([gate(), row])), 800.0)
+    (plain,) = surfaces_of(tiled(gate()), 800.0)
+    assert spurred.area == pytest.approx(plain.area, rel=0.01)
+
+
+def test_a_row_round_nothing_is_no_surface() -> None:
+    turn = np.linspace(0.0, 2.0 * np.pi, 300, endpoint=False)
+    circle = np.round(300.0 * np.stack([np.cos(turn), np.sin(turn)], axis=1)).astype(np.int64)
+    assert len(stitch(tiled(circle))) >= 2  # there and back
+    assert surfaces_of(tiled(circle), 800.0) == []
+
+
 def test_rings_begin_at_their_smallest_vertex() -> None:
     (ring,) = stitch(ring_edges(square(-7, 3, 20)))
     assert ring.tolist() == [[-7, 3], [13, 3], [13, 23], [-7, 23]]

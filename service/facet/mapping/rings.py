@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from facet.mapping.kernel import kernel
 
 OUTWARD = 2.0  # grid units (1/8 voxel): a border centroid sits inside its voxel
+ROW = 24  # grid units: points so near to one another are of one row of voxels
 _SHIFT = 1 << 30  # keys of vertices sort as vertices do
 
 
@@ -34,9 +35,10 @@ def _half(x, y):  # type: ignore[no-untyped-def]
 
 @kernel
 def _before(ax, ay, bx, by, rx, ry):  # type: ignore[no-untyped-def]
-    """Whether a comes before b, turning clockwise from the direction r (r itself comes last)."""
-    au, av = ax * rx + ay * ry, ax * ry - ay * rx  # in r's frame, clockwise positive
-    bu, bv = bx * rx + by * ry, bx * ry - by * rx
+    """Whether a comes before b, turning counter-clockwise from the direction r (r itself comes
+    last)."""
+    au, av = ax * rx + ay * ry, ay * rx - ax * ry  # in r's frame, counter-clockwise positive
+    bu, bv = bx * rx + by * ry, by * rx - bx * ry
     turn_a = 2 if av == 0 and au > 0 else _half(au, av)
     turn_b = 2 if bv == 0 and bu > 0 else _half(bu, bv)
     if turn_a != turn_b:
@@ -47,7 +49,8 @@ def _before(ax, ay, bx, by, rx, ry):  # type: ignore[no-untyped-def]
 @kernel
 def _successors(start, stop, edges):  # type: ignore[no-untyped-def]
     """(E,) for each edge the next of its ring; `start` is ascending. Interior on the left: at a
-    vertex the ring goes on with the first outgoing edge clockwise from the way it came."""
+    vertex the ring goes on along what is outside, with the first outgoing edge counter-clockwise
+    from the way it came."""
     count = start.shape[0]
     follow = np.empty(count, np.int64)
     for e in range(count):
@@ -79,11 +82,15 @@ def _keys(edges):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _single(start, stop):  # type: ignore[no-untyped-def]
-    """(E,) whether an edge is there one way only; edges ascend by (start, stop)."""
+def _single(start, stop, edges, row):  # type: ignore[no-untyped-def]
+    """(E,) whether an edge bounds something: it is there one way only, or it joins points at most
+    `row` apart; edges (E, 4) ascend by (start, stop)."""
     count = start.shape[0]
     single = np.ones(count, np.bool_)
     for e in range(count):
+        du, dv = edges[e, 2] - edges[e, 0], edges[e, 3] - edges[e, 1]
+        if du * du + dv * dv <= row * row:
+            continue
         o = np.searchsorted(start, stop[e])
         while o < count and start[o] == stop[e]:
             if stop[o] == start[e]:
@@ -117,7 +124,8 @@ def _chains(follow):  # type: ignore[no-untyped-def]
 def stitch(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """Closed rings (M, 2) of directed edges (E, 4), each from its smallest vertex, in order of it.
 
-    An edge that is there both ways bounds nothing (a strip without area) and is left out."""
+    An edge that is there both ways has no area at either side. A row of voxels is such a strip: the
+    threshold that closes a door. Others are left out."""
     if not len(edges):
         return []
     start, stop = _keys(edges)
@@ -125,7 +133,7 @@ def stitch(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     start, stop = start[order], stop[order]
     new = np.concatenate([[True], (start[1:] != start[:-1]) | (stop[1:] != stop[:-1])])
     order, start, stop = order[new], start[new], stop[new]
-    single = _single(start, stop)
+    single = _single(start, stop, edges[order], ROW)
     edges, start, stop = edges[order[single]], start[single], stop[single]
     chained, ends = _chains(_successors(start, stop, edges))
     rings = []
@@ -192,8 +200,8 @@ def surfaces_of(edges: NDArray[np.int64], least_area: float) -> list[Outline]:
             continue
         (u0, v0), (u1, v1) = ring[0].astype(float), ring[1].astype(float)
         length = float(np.hypot(u1 - u0, v1 - v0))
-        u = (u0 + u1) / 2 - 0.05 * (v1 - v0) / length  # just left of an edge: on the surface
-        v = (v0 + v1) / 2 + 0.05 * (u1 - u0) / length
+        u = (u0 + u1) / 2 + 0.05 * (v1 - v0) / length  # just right of an edge: in the hole
+        v = (v0 + v1) / 2 - 0.05 * (u1 - u0) / length
         for i in by_size:
             if inside(outers[i][0], u, v):
                 holes[i].append(ring)
@@ -202,6 +210,8 @@ def surfaces_of(edges: NDArray[np.int64], least_area: float) -> list[Outline]:
     for (outer, _), own in zip(outers, holes, strict=True):
         grown = outward(outer)
         shrunk = [h for h in (outward(hole) for hole in own) if signed_area(h) < 0.0]
+        if signed_area(outer) + sum(signed_area(hole) for hole in own) < least_area:
+            continue  # rows of voxels round nothing
         area = signed_area(grown) + float(sum(signed_area(h) for h in shrunk))
         outlines.append(Outline(grown, shrunk, area))
     return outlines
