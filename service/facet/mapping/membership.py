@@ -130,13 +130,15 @@ def inherit(old, new, scratch, counts):  # type: ignore[no-untyped-def]
 
 @kernel(parallel=True)
 def sum_points(  # type: ignore[no-untyped-def]
-    rows, corner, starts, tile_keys, shares, blocks, columns, border, second, nodes, points, total
-):
+    rows, corner, starts, tile_keys, shares, blocks, columns, border, second, nodes, planes, points,
+    total
+):  # fmt: skip
     """Sum the voxels' point moments about the tile's corner into points (T, 10), without those
     that hold points of others: at a border, claimed by a plane at an angle, or STRAY from their
     tile-plane; count all in total (T,). A tile-plane neither narrow nor wide is settled first:
     the rim of a table's top tilts it.
 
+    planes: (T, 4) comes out: unit normal and offset of what members are STRAY from.
     rows, corner: members of T tile-planes, one after another, those of t from starts[t] on;
     tile_keys: (T,); shares: (S + 1,) tile-planes that each thread begins with.
     Leftovers count as well: the tails of the noise lie in them, and without these a plane across
@@ -151,6 +153,7 @@ def sum_points(  # type: ignore[no-untyped-def]
             if RIMMED[0] <= width <= RIMMED[1]:
                 own = rows[starts[t] : starts[t + 1]], corner[starts[t] : starts[t + 1]]
                 plane = _settled(own, blocks, columns, border, second, tile_keys[t], plane)
+            planes[t, 0], planes[t, 1], planes[t, 2], planes[t, 3] = plane
             for start in range(starts[t], starts[t + 1], CHUNK):
                 stop = min(starts[t + 1], start + CHUNK)
                 own = rows[start:stop], corner[start:stop]
@@ -249,17 +252,13 @@ def _add(rows, columns, places, state, points):  # type: ignore[no-untyped-def]
 
 @kernel
 def add_changes(  # type: ignore[no-untyped-def]
-    rows, before, first, blocks, columns, border, patches, plane_of_patch, tile_keys, nodes, points,
-    total
+    rows, before, first, blocks, columns, border, patches, plane_of_patch, tile_keys, planes,
+    points, total
 ):  # fmt: skip
     """Add to `sum_points` of T tile-planes what came to their members `rows` (R,) since they had
     the sums `before` (R, SUMS). All else must be as it was then.
 
     first: (B,) of the tile-planes, that of a block's tile which comes first, -1: none of these."""
-    normals = np.empty((total.shape[0], 4))
-    for t in range(total.shape[0]):
-        nx, ny, nz, offset = _seen_from(nodes, t, tile_keys[t])
-        normals[t, 0], normals[t, 1], normals[t, 2], normals[t, 3] = nx, ny, nz, offset
     places, state = np.empty((1, 3), np.int64), np.empty(1, np.int8)
     sums, corner = np.empty(SUMS, np.int64), np.zeros(1, np.bool_)
     for q in range(rows.shape[0]):
@@ -270,7 +269,7 @@ def add_changes(  # type: ignore[no-untyped-def]
         if first[other] < 0:
             continue
         t = first[other] + plane_of_patch[other, label & 15]
-        plane = normals[t, 0], normals[t, 1], normals[t, 2], normals[t, 3]
+        plane = planes[t, 0], planes[t, 1], planes[t, 2], planes[t, 3]
         own = rows[q : q + 1], corner
         _look(own, blocks, columns, border, patches.second, tile_keys[t], plane, places, state)
         read_sums(columns, rows[q], sums)

@@ -43,6 +43,9 @@ class Tile:
     points: NDArray[np.int64]  # (T, 10) exact moments of pure voxels' points, tile corner; pure:
     # near its tile-plane, not at a border, and claimed by no plane at an angle
     total: NDArray[np.int64]  # (T,) points of all their voxels
+    planes: NDArray[
+        np.float64
+    ]  # (T, 4) what their voxels are near: unit normal, offset, tile corner
     occupation: NDArray[np.int64]  # (T,) voxels, leftovers included
     rows: NDArray[np.int32]  # (M,) voxel rows of its tile-planes, one after another
     corner: NDArray[np.bool_]  # (M,) only a claim on a corner voxel that belongs elsewhere
@@ -250,19 +253,23 @@ class TileField:
         tiles = [self.tiles[key] for key in keys]
         if not tiles:
             return
-        tile_keys, nodes = _joined(tiles)
+        tile_keys = _tile_keys(tiles)
+        nodes = Nodes(*(np.concatenate(c) for c in zip(*(t.nodes for t in tiles), strict=True)))
         starts = _starts(np.concatenate([np.diff(tile.starts) for tile in tiles]))
-        points = np.empty((len(tile_keys), MOMENTS), np.int64)
-        total = np.empty(len(points), np.int64)
+        points, total = (
+            np.empty((len(tile_keys), MOMENTS), np.int64),
+            np.empty(len(tile_keys), np.int64),
+        )
+        planes = np.empty((len(points), 4))
         shares = np.searchsorted(starts, np.linspace(0, starts[-1], SHARES + 1))
         shares[-1] = len(points)
         sum_points(
             np.concatenate([tile.rows for tile in tiles]),
             np.concatenate([tile.corner for tile in tiles]),
             starts, tile_keys, shares, store.blocks, store.columns, normals.border,
-            patches.patches.second, nodes, points, total,
+            patches.patches.second, nodes, planes, points, total,
         )  # fmt: skip
-        _hand_out(tiles, points, total)
+        _hand_out(tiles, points, total, planes)
 
     def _add(
         self,
@@ -276,17 +283,19 @@ class TileField:
         tiles = [self.tiles[key] for key in keys]
         if not tiles:
             return
-        tile_keys, nodes = _joined(tiles)
+        tile_keys = _tile_keys(tiles)
         first = np.full(store.num_blocks, -1, np.int32)
         for tile, start in zip(tiles, np.searchsorted(tile_keys, keys).tolist(), strict=True):
             first[tile.blocks] = start
         points = np.concatenate([tile.points for tile in tiles])
         total = np.concatenate([tile.total for tile in tiles])
+        planes = np.concatenate([tile.planes for tile in tiles])
         add_changes(
             touched.rows, touched.before, first, store.blocks, store.columns, normals.border,
-            patches.patches, self.plane_of_patch, tile_keys, nodes, points, total,
+            patches.patches, self.plane_of_patch, tile_keys,
+            planes, points, total,
         )  # fmt: skip
-        _hand_out(tiles, points, total)
+        _hand_out(tiles, points, total, planes)
 
     def _beside(self, keys: list[int]) -> list[int]:
         """The tiles and their 26 neighbours, as far as they exist, ascending."""
@@ -330,18 +339,23 @@ def _starts(sizes: Any) -> NDArray[np.int64]:
     return np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)]).astype(np.int64)
 
 
-def _joined(tiles: list[Tile]) -> tuple[NDArray[np.int64], Nodes]:
-    """The tile-planes of tiles, one after another: keys of their tiles (T,), and statistics."""
-    sizes = [tile.num_planes for tile in tiles]
-    nodes = Nodes(*(np.concatenate(c) for c in zip(*(t.nodes for t in tiles), strict=True)))
-    return np.repeat(np.array([tile.key for tile in tiles], np.int64), sizes), nodes
+def _tile_keys(tiles: list[Tile]) -> NDArray[np.int64]:
+    """(T,) keys of the tiles of tile-planes, one tile after another."""
+    keys = np.array([tile.key for tile in tiles], np.int64)
+    return np.repeat(keys, [tile.num_planes for tile in tiles])
 
 
-def _hand_out(tiles: list[Tile], points: NDArray[np.int64], total: NDArray[np.int64]) -> None:
-    """Give tiles the sums of their tile-planes."""
+def _hand_out(
+    tiles: list[Tile],
+    points: NDArray[np.int64],
+    total: NDArray[np.int64],
+    planes: NDArray[np.float64],
+) -> None:
+    """Give tiles the sums of their tile-planes, and what these are near."""
     ends = np.cumsum([tile.num_planes for tile in tiles]).tolist()
     for tile, low, high in zip(tiles, [0, *ends], ends, strict=False):
         tile.points, tile.total = points[low:high].copy(), total[low:high].copy()
+        tile.planes = planes[low:high].copy()
 
 
 _NO_ROWS, _NO_KEYS = np.zeros(0, np.int32), np.zeros(0, np.int64)
@@ -350,7 +364,7 @@ _NO_ROWS, _NO_KEYS = np.zeros(0, np.int32), np.zeros(0, np.int64)
 def _empty_tile(key: int, blocks: NDArray[np.int32]) -> Tile:
     nodes = Nodes(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 6)), np.zeros((0, 3)))
     return Tile(
-        key, blocks, nodes, np.zeros((0, MOMENTS), np.int64),
-        np.zeros(0, np.int64), np.zeros(0, np.int64),
+        key, blocks, nodes, np.zeros((0, MOMENTS), np.int64), np.zeros(0, np.int64),
+        np.zeros((0, 4)), np.zeros(0, np.int64),
         np.zeros(0, np.int32), np.zeros(0, np.bool_), np.zeros(1, np.int64),
     )  # fmt: skip
