@@ -4,6 +4,9 @@ On a plane the members' normals do not depend on where they are; along a curved 
 bevelled edge, they turn steadily. Whatever turns goes to the remainder (design 3.4). At the edges
 of a narrow plane points of the faces beyond turn the normals as well, so where a narrow strip has
 members enough it is bent only if they lie on an arc too, which turns the same way.
+
+Nor is a strip a plane whose members lie along its two sides with nothing between: the rims of the
+two faces of a free-standing wall.
 """
 
 from __future__ import annotations
@@ -31,6 +34,9 @@ ARC_VOTES = 200  # of so many members at least must lie on an arc to be bent,
 ARC_NORMALS_DEG = 8.5  # whose normals turn by so much,
 ARC_DEG = 5.0  # and which turns by so much itself,
 ARC_SIGMAS = 3.5  # and surely
+FULL = 0.45  # voxels for each that a strip spans: it is not hollow
+HOLLOW = 0.8  # bimodality across a strip: 1 of two lines, 0.56 where it is filled evenly
+GAP_WIDTH = 4.0  # voxels: a narrower strip has no place for a gap
 
 
 @kernel
@@ -76,16 +82,18 @@ def _add_members(store, normals, patches, members, plane_of, origin, sums):  # t
 
 
 @kernel
-def _add_heights(store, normals, patches, members, plane_of, origin, axes, sums):  # type: ignore[no-untyped-def]
-    """Likewise add to sums (K, ARC) where they are across the strip, and how far off its plane.
-    axes: (K, 6) unit vectors across it and along its normal."""
+def _add_heights(store, normals, patches, members, plane_of, origin, axes, pure, sums):  # type: ignore[no-untyped-def]
+    """Likewise add to sums (K, ARC) where members are across the strip, and how far off its plane.
+    axes: (K, 6) unit vectors across it and along its normal; pure: (K,) of pure members alone."""
     rows, corner, starts = members
     x = np.empty(3, np.int64)
     for plane in range(plane_of.shape[0]):
         k = plane_of[plane]
         for m in range(starts[plane], starts[plane + 1] if k >= 0 else 0):
             row = rows[m]
-            if corner[m] or not _is_pure(normals, patches, row):
+            if corner[m] or patches.member[row] < 0:
+                continue
+            if pure[k] and not _is_pure(normals, patches, row):
                 continue
             _place(store, row, origin[k], x)
             u = axes[k]
@@ -111,8 +119,14 @@ class Turn(NamedTuple):
     axes: NDArray[np.float64]  # (6,) that direction, and the strip's normal
 
 
+def _spans(votes: float, scatter: NDArray[np.float64]) -> tuple[float, float]:
+    """Width and length, voxels."""
+    *_, middle, largest = smallest(scatter)
+    return float(np.sqrt(12.0 * max(0.0, middle) / votes)), float(np.sqrt(12.0 * largest / votes))
+
+
 def _turns(own: NDArray[np.int64]) -> list[Turn]:
-    """Over the width and the length, as far as there is any."""
+    """Over the width, and over the length."""
     n = float(own[0])
     mean, unit = own[1:4] / n, own[10:13] / n / UNIT
     xx = own[4:10] / n - np.array([mean[a] * mean[b] for a in range(3) for b in range(a, 3)])
@@ -124,6 +138,7 @@ def _turns(own: NDArray[np.int64]) -> list[Turn]:
     turns = []
     for variance in (middle, largest):
         if variance < 1.0:
+            turns.append(Turn(0.0, 0.0, np.zeros(6)))
             continue
         axis = np.array(eigenvector(xx[0], xx[3], xx[5], xx[1], xx[2], xx[4], variance))
         width = float(np.sqrt(12.0 * variance))
@@ -143,6 +158,23 @@ def _arc(own: NDArray[np.int64], width: float) -> tuple[float, float]:
     bow = (hs2 - hs1 * s3 / s2) / own_s4
     rest = h2 - hs1 * hs1 / s2 - bow * bow * own_s4
     return -2.0 * bow * width, 2.0 * width * float(np.sqrt(max(rest, 0.0) / (n * own_s4)))
+
+
+def _bimodality(own: NDArray[np.int64]) -> float:
+    """Sarle's coefficient across the strip: (skewness^2 + 1) / kurtosis."""
+    n = float(own[0])
+    s, ss, sss, ssss = own[1:5] / n
+    m2 = float(ss - s * s)
+    m3 = float(sss - 3.0 * s * ss + 2.0 * s**3)
+    m4 = float(ssss - 4.0 * s * sss + 6.0 * s * s * ss - 3.0 * s**4)
+    return (m3 * m3 + m2**3) / (m4 * m2) if m2 > 0.0 else 0.0
+
+
+def _axes(scatter: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(6,) unit vectors across a strip and along its normal."""
+    _, nx, ny, nz, middle, _ = smallest(scatter)
+    a, d, e, b, f, c = scatter
+    return np.array([*eigenvector(a, b, c, d, e, f, middle), nx, ny, nz])
 
 
 class Bends:
@@ -169,55 +201,51 @@ class Bends:
         """(K,) whether a plane is wide enough to be one and, if it is a strip, not bent.
 
         label: (T,) plane of each tile-plane, in the order of tile_keys and starts."""
-        widths = np.array(
-            [
-                np.sqrt(12.0 * max(0.0, smallest(s)[4]) / v)
-                for s, v in zip(nodes.scatter, nodes.votes, strict=True)
-            ]
-        )
-        wide = widths >= self._settings.min_width
-        strips = wide & (widths < self._settings.strip_width)
+        spans = np.array([_spans(v, s) for v, s in zip(nodes.votes, nodes.scatter, strict=True)])
+        widths, lengths = spans.reshape(-1, 2).T
+        flat = widths >= self._settings.min_width
+        strips = flat & (widths < self._settings.strip_width)
         origin = np.floor(nodes.mean * STEPS).astype(np.int64)
         sums = np.zeros((len(strips), SUMS), np.int64)
         self._sum(_add_members, tile_keys, starts, label, strips, origin, sums)
         limit = np.radians(self._settings.bend_deg)
-        doubtful: dict[int, Turn] = {}
+        arcs: dict[int, Turn] = {}
         for plane in np.flatnonzero(strips & (sums[:, 0] >= self._settings.n_min)).tolist():
-            turns = _turns(sums[plane])
-            across = turns[0]
-            if across.width < ARC_WIDTH and sums[plane, 0] >= ARC_VOTES:
-                wide[plane] = all(abs(t.angle) <= limit for t in turns[1:])
-                if wide[plane] and abs(across.angle) > np.radians(ARC_NORMALS_DEG):
-                    doubtful[plane] = across
-            else:
-                wide[plane] = all(abs(t.angle) <= limit for t in turns)
-        for plane in self._arched(tile_keys, starts, label, origin, doubtful):
-            wide[plane] = False
-        return wide
+            across, along = _turns(sums[plane])
+            narrow = across.width < ARC_WIDTH and sums[plane, 0] >= ARC_VOTES
+            flat[plane] = abs(along.angle) <= limit and (narrow or abs(across.angle) <= limit)
+            if flat[plane] and narrow and abs(across.angle) > np.radians(ARC_NORMALS_DEG):
+                arcs[plane] = across
+        axes = np.zeros((len(origin), 6))
+        pure = np.isin(np.arange(len(origin)), list(arcs))
+        held = self._occupation(tile_keys, starts, label, len(origin))
+        thin = strips & flat & ~pure & (widths >= GAP_WIDTH) & (held < FULL * widths * lengths)
+        for plane in np.flatnonzero(pure | thin).tolist():
+            axes[plane] = arcs[plane].axes if pure[plane] else _axes(nodes.scatter[plane])
+        heights = np.zeros((len(origin), ARC), np.int64)
+        self._sum(_add_heights, tile_keys, starts, label, pure | thin, origin, axes, pure, heights)
+        for plane, across in arcs.items():
+            angle, deviation = _arc(heights[plane], across.width)
+            least = max(np.radians(ARC_DEG), ARC_SIGMAS * deviation)
+            flat[plane] = angle * np.sign(across.angle) <= least
+        for plane in np.flatnonzero(thin).tolist():
+            flat[plane] = _bimodality(heights[plane]) < HOLLOW
+        return flat
 
-    def _arched(
+    def _occupation(
         self,
         tile_keys: NDArray[np.int64],
         starts: NDArray[np.int64],
         label: NDArray[np.int64],
-        origin: NDArray[np.int64],
-        turns: dict[int, Turn],
-    ) -> list[int]:
-        """Those of the planes `turns` that lie on an arc which turns as their normals do."""
-        if not turns:
-            return []
-        asked = np.isin(np.arange(len(origin)), list(turns))
-        axes, sums = np.zeros((len(origin), 6)), np.zeros((len(origin), ARC), np.int64)
-        for plane, turn in turns.items():
-            axes[plane] = turn.axes
-        self._sum(_add_heights, tile_keys, starts, label, asked, origin, axes, sums)
-        arched = []
-        for plane, turn in turns.items():
-            angle, deviation = _arc(sums[plane], turn.width)
-            least = max(np.radians(ARC_DEG), ARC_SIGMAS * deviation)
-            if angle * np.sign(turn.angle) > least:
-                arched.append(plane)
-        return arched
+        count: int,
+    ) -> NDArray[np.float64]:
+        """(K,) voxels of each plane."""
+        held = np.zeros(count)
+        for index, key in enumerate(tile_keys.tolist()):
+            own = label[starts[index] : starts[index + 1]]
+            on = own >= 0
+            np.add.at(held, own[on], self._tiles.tiles[key].occupation[on])
+        return held
 
     def _sum(
         self,
