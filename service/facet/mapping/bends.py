@@ -213,7 +213,8 @@ class Bends:
         for plane in np.flatnonzero(strips & (sums[:, 0] >= self._settings.n_min)).tolist():
             across, along = _turns(sums[plane])
             narrow = across.width < ARC_WIDTH and sums[plane, 0] >= ARC_VOTES
-            flat[plane] = abs(along.angle) <= limit and (narrow or abs(across.angle) <= limit)
+            most = np.inf if narrow else limit  # over edges, that it may bulge
+            flat[plane] = abs(along.angle) <= limit and -limit <= across.angle <= most
             if flat[plane] and narrow and abs(across.angle) > np.radians(ARC_NORMALS_DEG):
                 arcs[plane] = across
         axes = np.zeros((len(origin), 6))

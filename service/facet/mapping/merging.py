@@ -17,6 +17,7 @@ from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.settings import MapSettings
 
+NARROW = 5.0  # voxels: of a narrower node the fit tells no more than its members' normals
 TRUSTED = 30  # below this many voxels the mean normal is trusted more than the fit
 
 
@@ -118,24 +119,29 @@ def _agreement(nx, ny, nz, unit):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _mean_cos(normals, unit, a, b):  # type: ignore[no-untyped-def]
-    """Cosine between a's normal and the mean normal of b's members."""
-    return _agreement(normals[a, 0], normals[a, 1], normals[a, 2], unit[b])
+def _best_cos(normals, narrow, unit, a, b):  # type: ignore[no-untyped-def]
+    """Cosine between the normals of a and b. A narrow b may have that of its fit or the mean of its
+    members', as the one turns with its noise, the other with what lies beside it."""
+    cos = _dot(normals, a, b)
+    if narrow[b]:
+        cos = max(cos, _agreement(normals[a, 0], normals[a, 1], normals[a, 2], unit[b]))
+    return cos
 
 
 @kernel
 def edge_costs(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-def]
     """(E,) cost of merging along each edge; inf where its two ends disagree by themselves."""
-    normals = np.empty((votes.shape[0], 3))
+    normals, narrow = np.empty((votes.shape[0], 3)), np.empty(votes.shape[0], np.bool_)
     for t in range(votes.shape[0]):
-        nx, ny, nz, _, _ = plane_of(votes[t], scatter[t], unit[t])
+        nx, ny, nz, _, across = plane_of(votes[t], scatter[t], unit[t])
         normals[t, 0], normals[t, 1], normals[t, 2] = nx, ny, nz
+        narrow[t] = 12.0 * across < NARROW * NARROW
     costs = np.empty(edges.shape[0])
     for e in range(edges.shape[0]):
         a, b = edges[e, 0], edges[e, 1]
         if votes[b] > votes[a]:
             a, b = b, a
-        cos = max(_dot(normals, a, b), _mean_cos(normals, unit, a, b))
+        cos = _best_cos(normals, narrow, unit, a, b)
         w = abs(_offset(normals, mean, a, b))
         if cos < limit.edge_cos or w > limit.offset:
             costs[e] = np.inf
@@ -153,9 +159,9 @@ def _root(parent, t):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _try(votes, mean, scatter, unit, normals, a, b, limit, m, s, u):  # type: ignore[no-untyped-def]
+def _try(votes, mean, scatter, unit, normals, narrow, a, b, limit, m, s, u):  # type: ignore[no-untyped-def]
     """Whether a and b (a the larger) are one plane; m, s, u are then its statistics."""
-    if _dot(normals, a, b) < limit.cos and _mean_cos(normals, unit, a, b) < limit.cos:
+    if _best_cos(normals, narrow, unit, a, b) < limit.cos:
         return False
     w = _offset(normals, mean, a, b)
     if abs(w) > limit.offset:
@@ -186,10 +192,11 @@ def merge(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-
     count = votes.shape[0]
     parent = np.arange(count)
     version = np.zeros(count, np.int64)
-    normals = np.empty((count, 3))
+    normals, narrow = np.empty((count, 3)), np.empty(count, np.bool_)
     for t in range(count):
-        nx, ny, nz, _, _ = plane_of(votes[t], scatter[t], unit[t])
+        nx, ny, nz, _, across = plane_of(votes[t], scatter[t], unit[t])
         normals[t, 0], normals[t, 1], normals[t, 2] = nx, ny, nz
+        narrow[t] = 12.0 * across < NARROW * NARROW
     m, s, u = np.zeros(3), np.zeros(6), np.zeros(3)
     tried = np.full((edges.shape[0], 2), -1, np.int64)
     merged = True
@@ -201,14 +208,15 @@ def merge(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-
                 continue
             tried[e, 0], tried[e, 1] = version[a], version[b]
             large, small = (a, b) if votes[a] >= votes[b] else (b, a)
-            if not _try(votes, mean, scatter, unit, normals, large, small, limit, m, s, u):
+            if not _try(votes, mean, scatter, unit, normals, narrow, large, small, limit, m, s, u):
                 continue
             merged = True
             keep, drop = min(a, b), max(a, b)
             parent[drop] = keep
             votes[keep] = votes[a] + votes[b]
             mean[keep], scatter[keep], unit[keep] = m, s, u
-            nx, ny, nz, _, _ = plane_of(votes[keep], s, u)
+            nx, ny, nz, _, across = plane_of(votes[keep], s, u)
+            narrow[keep] = 12.0 * across < NARROW * NARROW
             normals[keep, 0], normals[keep, 1], normals[keep, 2] = nx, ny, nz
             version[keep] = version[a] + version[b] + 1
     for t in range(count):
