@@ -31,7 +31,7 @@ from facet.mapping.sums import (
 )
 
 SETTLED = 64  # from so many points on a centroid is rounded to 1/4 voxel: it moves half as often
-NOTED = 1 << 16  # touched voxels whose sums before are noted: more come in no few scans
+NOTED = 1 << 15  # touched voxels whose sums before are noted: more come in no few scans
 
 
 class Touched(NamedTuple):
