@@ -119,32 +119,52 @@ class Turn(NamedTuple):
     axes: NDArray[np.float64]  # (6,) that direction, and the strip's normal
 
 
-def _spans(votes: float, scatter: NDArray[np.float64]) -> tuple[float, float]:
-    """Width and length, voxels."""
-    *_, middle, largest = smallest(scatter)
-    return float(np.sqrt(12.0 * max(0.0, middle) / votes)), float(np.sqrt(12.0 * largest / votes))
+@kernel
+def _spans(votes, scatter):  # type: ignore[no-untyped-def]
+    """(K, 2) width and length of planes, voxels."""
+    out = np.empty((votes.shape[0], 2))
+    for k in range(votes.shape[0]):
+        _, _, _, _, middle, largest = smallest(scatter[k])
+        out[k, 0] = np.sqrt(12.0 * max(0.0, middle) / votes[k])
+        out[k, 1] = np.sqrt(12.0 * max(0.0, largest) / votes[k])
+    return out
 
 
-def _turns(own: NDArray[np.int64]) -> list[Turn]:
-    """Over the width, and over the length."""
-    n = float(own[0])
-    mean, unit = own[1:4] / n, own[10:13] / n / UNIT
-    xx = own[4:10] / n - np.array([mean[a] * mean[b] for a in range(3) for b in range(a, 3)])
-    ux = own[13:22].reshape(3, 3) / n / UNIT - np.outer(unit, mean)
-    _, nx, ny, nz, middle, largest = smallest(xx)
-    normal = np.array([nx, ny, nz])
-    if float(normal @ unit) < 0.0:
-        normal = -normal
-    turns = []
-    for variance in (middle, largest):
-        if variance < 1.0:
-            turns.append(Turn(0.0, 0.0, np.zeros(6)))
+@kernel
+def _turns(sums):  # type: ignore[no-untyped-def]
+    """(K, 2, 8) by plane, over the width and over the length: angle, width and axes of a `Turn`,
+    all 0 where there is none."""
+    out = np.zeros((sums.shape[0], 2, 8))
+    mean, unit, xx, normal = np.empty(3), np.empty(3), np.empty(6), np.empty(3)
+    for k in range(sums.shape[0]):
+        own = sums[k]
+        if own[0] == 0:
             continue
-        axis = np.array(eigenvector(xx[0], xx[3], xx[5], xx[1], xx[2], xx[4], variance))
-        width = float(np.sqrt(12.0 * variance))
-        slope = float(axis @ ux @ axis) / variance
-        turns.append(Turn(slope * width, width / STEPS, np.concatenate([axis, normal])))
-    return turns
+        n = float(own[0])
+        s = 0
+        for a in range(3):
+            mean[a], unit[a] = own[1 + a] / n, own[10 + a] / n / UNIT
+        for a in range(3):
+            for b in range(a, 3):
+                xx[s] = own[4 + s] / n - mean[a] * mean[b]
+                s += 1
+        _, normal[0], normal[1], normal[2], middle, largest = smallest(xx)
+        side = normal[0] * unit[0] + normal[1] * unit[1] + normal[2] * unit[2]
+        for way in range(2):
+            variance = largest if way else middle
+            if variance < 1.0:
+                continue
+            axis = eigenvector(xx[0], xx[3], xx[5], xx[1], xx[2], xx[4], variance)
+            slope = 0.0
+            for a in range(3):
+                for b in range(3):
+                    ux = own[13 + 3 * a + b] / n / UNIT - unit[a] * mean[b]
+                    slope += axis[a] * ux * axis[b]
+                out[k, way, 2 + a] = axis[a]
+                out[k, way, 5 + a] = normal[a] if side >= 0.0 else -normal[a]
+            width = np.sqrt(12.0 * variance)
+            out[k, way, 0], out[k, way, 1] = slope / variance * width, width / STEPS
+    return out
 
 
 def _arc(own: NDArray[np.int64], width: float) -> tuple[float, float]:
@@ -201,8 +221,7 @@ class Bends:
         """(K,) whether a plane is wide enough to be one and, if it is a strip, not bent.
 
         label: (T,) plane of each tile-plane, in the order of tile_keys and starts."""
-        spans = np.array([_spans(v, s) for v, s in zip(nodes.votes, nodes.scatter, strict=True)])
-        widths, lengths = spans.reshape(-1, 2).T
+        widths, lengths = _spans(nodes.votes, nodes.scatter).T
         flat = widths >= self._settings.min_width
         strips = flat & (widths < self._settings.strip_width)
         origin = np.floor(nodes.mean * STEPS).astype(np.int64)
@@ -210,8 +229,9 @@ class Bends:
         self._sum(_add_members, tile_keys, starts, label, strips, origin, sums)
         limit = np.radians(self._settings.bend_deg)
         arcs: dict[int, Turn] = {}
+        turns = _turns(sums)
         for plane in np.flatnonzero(strips & (sums[:, 0] >= self._settings.n_min)).tolist():
-            across, along = _turns(sums[plane])
+            across, along = (Turn(float(t[0]), float(t[1]), t[2:]) for t in turns[plane])
             narrow = across.width < ARC_WIDTH and sums[plane, 0] >= ARC_VOTES
             most = np.inf if narrow else limit  # over edges, that it may bulge
             flat[plane] = abs(along.angle) <= limit and -limit <= across.angle <= most
@@ -219,7 +239,7 @@ class Bends:
                 arcs[plane] = across
         axes = np.zeros((len(origin), 6))
         pure = np.isin(np.arange(len(origin)), list(arcs))
-        held = self._occupation(tile_keys, starts, label, len(origin))
+        held = self._occupation(tile_keys, label, len(origin))
         thin = strips & flat & ~pure & (widths >= GAP_WIDTH) & (held < FULL * widths * lengths)
         for plane in np.flatnonzero(pure | thin).tolist():
             axes[plane] = arcs[plane].axes if pure[plane] else _axes(nodes.scatter[plane])
@@ -231,22 +251,16 @@ class Bends:
             flat[plane] = angle * np.sign(across.angle) <= least
         for plane in np.flatnonzero(thin).tolist():
             flat[plane] = _bimodality(heights[plane]) < HOLLOW
-        return flat
+        return np.asarray(flat)
 
     def _occupation(
-        self,
-        tile_keys: NDArray[np.int64],
-        starts: NDArray[np.int64],
-        label: NDArray[np.int64],
-        count: int,
+        self, tile_keys: NDArray[np.int64], label: NDArray[np.int64], count: int
     ) -> NDArray[np.float64]:
         """(K,) voxels of each plane."""
-        held = np.zeros(count)
-        for index, key in enumerate(tile_keys.tolist()):
-            own = label[starts[index] : starts[index + 1]]
-            on = own >= 0
-            np.add.at(held, own[on], self._tiles.tiles[key].occupation[on])
-        return held
+        own = [self._tiles.tiles[key].occupation for key in tile_keys.tolist()]
+        on = label >= 0
+        weights = np.concatenate([np.zeros(0, np.int64), *own])[on]
+        return np.bincount(label[on], weights, minlength=count).astype(np.float64)
 
     def _sum(
         self,
@@ -257,13 +271,19 @@ class Bends:
         asked: NDArray[np.bool_],
         *arguments: NDArray[Any],
     ) -> None:
-        """Hand the members of the planes that are `asked` for (K,), tile by tile, to `add`."""
-        wanted = np.where(label >= 0, label, 0)
-        plane_of = np.where((label >= 0) & asked[wanted], label, -1) if len(asked) else label
+        """Hand the members of the planes that are `asked` for (K,) to `add`, all at once."""
+        held = np.flatnonzero(label >= 0)
+        nodes = held[asked[label[held]]]
+        if not len(nodes):
+            return
+        at = np.searchsorted(starts, nodes, side="right") - 1
+        tiles = [self._tiles.tiles[key] for key in tile_keys[at].tolist()]
+        numbers = (nodes - starts[at]).tolist()
+        parts = [slice(*t.starts[n : n + 2]) for t, n in zip(tiles, numbers, strict=True)]
+        rows = [tile.rows[part] for tile, part in zip(tiles, parts, strict=True)]
+        corner = [tile.corner[part] for tile, part in zip(tiles, parts, strict=True)]
+        ends = np.concatenate([[0], np.cumsum([len(own) for own in rows])]).astype(np.int64)
+        members = np.concatenate(rows), np.concatenate(corner), ends
         store = self._store.blocks, self._store.columns
-        for index, key in enumerate(tile_keys.tolist()):
-            own = plane_of[starts[index] : starts[index + 1]]
-            if (own >= 0).any():
-                tile = self._tiles.tiles[key]
-                members = tile.rows, tile.corner, tile.starts
-                add(store, self._normals.normals, self._patches.patches, members, own, *arguments)
+        normals, patches = self._normals.normals, self._patches.patches
+        add(store, normals, patches, members, label[nodes], *arguments)

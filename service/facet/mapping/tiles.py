@@ -328,9 +328,7 @@ class TileField:
 def ends_of(pairs: NDArray[np.int64], tile_keys: NDArray[np.int64]) -> NDArray[np.int64]:
     """(P, 3) own tile-plane, key of the other tile and its tile-plane, of the pairs (P,) of tiles
     with these keys (P,)."""
-    place = (pairs >> 16) & 0xFFFF
-    offset = np.stack([place % 3, (place // 3) % 3, place // 9], axis=1) - 1
-    other = pack_all(unpack_all(tile_keys) + offset)
+    other = tile_keys + _STEPS[(pairs >> 16) & 0xFFFF]
     return np.stack([pairs >> 32, other, pairs & 0xFFFF], axis=1)
 
 
@@ -358,6 +356,8 @@ def _hand_out(
         tile.planes = planes[low:high].copy()
 
 
+_STEPS = np.array([pack(n % 3, n // 3 % 3, n // 9) for n in range(27)], np.int64)
+_STEPS -= pack(1, 1, 1)  # from a tile's key to those round it
 _NO_ROWS, _NO_KEYS = np.zeros(0, np.int32), np.zeros(0, np.int64)
 
 
