@@ -40,6 +40,11 @@ class Rule(NamedTuple):
     offset: float  # 1/8 voxels, of a voxel from the plane of its own region
     border: float  # 1/8 voxels per voxel of radius, in the plane, from the centroid of the region
     slab: float  # 1/8 voxels, half width of the slab that votes in the second look
+    thin_slab: float  # likewise in the last look, where surfaces meet
+    thin_passes: int
+    thin_points: int
+    thin_share: int
+    tan_mixed: float
     passes: int
     shrink: int
     least_first: int
@@ -70,6 +75,11 @@ def make_rule(settings: MapSettings) -> Rule:
         offset=settings.own_offset * STEPS,
         border=settings.border * STEPS,
         slab=settings.slab * STEPS,
+        thin_slab=settings.thin_slab * STEPS,
+        thin_passes=settings.thin_passes,
+        thin_points=settings.thin_points,
+        thin_share=settings.thin_share,
+        tan_mixed=math.tan(math.radians(settings.mixed_deg)),
         passes=settings.passes,
         shrink=settings.shrink,
         least_first=settings.least_first,
@@ -139,6 +149,7 @@ def estimate(halo, margin, local, seen, rule, scratch):  # type: ignore[no-untyp
         return SPARSE, 0, 0, 0, 0, False, reach
     one_pose = seen >> 32 != 0 and is_one_pose(lists, votes, count, r)
     kind, nx, ny, nz, tan_gamma = _classify(sums, seen, one_pose, rule)
+    every, whole = sums[0], tan_gamma  # of all that the region holds
     outlier = rule.outlier * ((seen >> 12) & 15) * sums[0] <= sums[1]  # of few points, among many
     beside = kind == THICK and tan_gamma <= rule.tan_theta  # a plane, not on it: a noise shell
     if kind != ALIGNED and (outlier or beside):
@@ -161,6 +172,15 @@ def estimate(halo, margin, local, seen, rule, scratch):  # type: ignore[no-untyp
             break
         _, nx, ny, nz, _ = _classify(sums, seen, one_pose, rule)
         kind = THICK
+    dense = sums[1] >= rule.thin_points * sums[0]  # centroids are sure enough for a thinner slab
+    nearly = kind == THICK and tan_gamma < rule.tan_mixed < whole
+    if nearly and dense and r > 1:  # a step: a narrow face between two
+        for _ in range(rule.thin_passes):
+            own = nx * cx + ny * cy + nz * cz
+            within_slab(votes, count, r, nx, ny, nz, own, rule.thin_slab, sums)
+            if rule.thin_share * sums[0] < every:  # a slice of a lump
+                return THICK, 0, 0, 0, 255, False, reach
+            kind, nx, ny, nz, tan_gamma = _classify(sums, seen, one_pose, rule)
     if kind == VALID and (seen >> 31) & 1 == 1 and _towards(seen, nx, ny, nz) < 4.0:
         kind = MIXED  # both sides of a thin thing, not one side from two directions
     half_degrees = np.int64(np.floor(np.arctan(tan_gamma) * 114.59155902616465 + 0.5))

@@ -2,8 +2,8 @@
 
 On a plane the members' normals do not depend on where they are; along a curved wall, or over a
 bevelled edge, they turn steadily. Whatever turns goes to the remainder (design 3.4). At the edges
-of a narrow plane points of the faces beyond turn the normals as well, so where a narrow strip has
-members enough it is bent only if they lie on an arc too, which turns the same way.
+of a narrow plane points of the faces beyond turn the normals as well, mostly so that it seems to
+bulge; so where a narrow strip has members enough they are asked whether they lie on an arc, too.
 
 Nor is a strip a plane whose members lie along its two sides with nothing between: the rims of the
 two faces of a free-standing wall.
@@ -30,13 +30,14 @@ from facet.mapping.tiles import TileField
 SUMS = 22  # n; sum x (3), xx (6); sum u (3), u x (9): x in 1/8 voxels, u normals times UNIT
 ARC = 9  # n; sum s, ss, sss, ssss, h, hh, hs, hss: 1/8 voxels across, 1/64 voxels off the plane
 ARC_WIDTH = 10.0  # voxels: a narrower strip
-ARC_VOTES = 200  # of so many members at least must lie on an arc to be bent,
-ARC_NORMALS_DEG = 8.5  # whose normals turn by so much,
-ARC_DEG = 5.0  # and which turns by so much itself,
-ARC_SIGMAS = 3.5  # and surely
-FULL = 0.45  # voxels for each that a strip spans: it is not hollow
-HOLLOW = 0.8  # bimodality across a strip: 1 of two lines, 0.56 where it is filled evenly
-GAP_WIDTH = 4.0  # voxels: a narrower strip has no place for a gap
+ARC_VOTES = 200  # of so many members at least is bent where its normals turn so that it
+HOLLOWED_DEG = 10.5  # is hollow by this,
+ASKED_DEG = 8.5  # or by this, or bulges by `bend_deg`, and they lie on an arc
+ARC_DEG = 5.0  # that turns by this the same way
+ARC_SIGMAS = 3.5  # surely
+FULL = 0.45  # voxels for each that a strip spans: something lies between its sides
+EMPTY = 0.8  # bimodality across a strip: 1 of two lines, 0.56 where it is filled evenly
+GAP_WIDTH = 4.0  # voxels: a narrower strip has no place for that
 
 
 @kernel
@@ -233,9 +234,10 @@ class Bends:
         for plane in np.flatnonzero(strips & (sums[:, 0] >= self._settings.n_min)).tolist():
             across, along = (Turn(float(t[0]), float(t[1]), t[2:]) for t in turns[plane])
             narrow = across.width < ARC_WIDTH and sums[plane, 0] >= ARC_VOTES
-            most = np.inf if narrow else limit  # over edges, that it may bulge
-            flat[plane] = abs(along.angle) <= limit and -limit <= across.angle <= most
-            if flat[plane] and narrow and abs(across.angle) > np.radians(ARC_NORMALS_DEG):
+            low, high = (-np.radians(HOLLOWED_DEG), np.inf) if narrow else (-limit, limit)
+            flat[plane] = abs(along.angle) <= limit and low <= across.angle <= high
+            asked = across.angle < -np.radians(ASKED_DEG) or across.angle > limit
+            if flat[plane] and narrow and asked:
                 arcs[plane] = across
         axes = np.zeros((len(origin), 6))
         pure = np.isin(np.arange(len(origin)), list(arcs))
@@ -250,7 +252,7 @@ class Bends:
             least = max(np.radians(ARC_DEG), ARC_SIGMAS * deviation)
             flat[plane] = angle * np.sign(across.angle) <= least
         for plane in np.flatnonzero(thin).tolist():
-            flat[plane] = _bimodality(heights[plane]) < HOLLOW
+            flat[plane] = _bimodality(heights[plane]) < EMPTY
         return np.asarray(flat)
 
     def _occupation(

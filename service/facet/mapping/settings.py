@@ -42,6 +42,11 @@ class MapSettings:
     border: float = 0.35  # in-plane offset from its region's centroid, radii, at a border
     slab: float = 1.0
     passes: int = 2
+    thin_slab: float = 0.75  # of the last look where surfaces meet, if voxels hold points enough
+    thin_passes: int = 8
+    mixed_deg: float = 25.0  # thickness angle of a region in which surfaces meet
+    thin_points: int = 6  # mean of a region's voxels, each counted as 8 at most
+    thin_share: int = 2  # one vote of so many at least must lie in it
     shrink: int = 2
     least_first: int = 6
     # patches and their leftovers
