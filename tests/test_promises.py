@@ -92,7 +92,7 @@ PROMISES: dict[str, str] = {
     "S3": "session::no_password_or_a_wrong_one_is_no_session "
     "session::no_certificate_a_foreign_or_an_old_one_is_no_session",
     "S4": "security::s4_a_flood_of_connections_and_junk_starves_nobody "
-    "acknowledged::s4_a_flood_delays_no_one",
+    "acknowledged::a_flood_keeps_no_one_out acknowledged::s4_a_flood_delays_no_one",
     "S5": "session::a_robot_speaks_under_its_own_name_only "
     "corrections::what_is_wrong_with_one_refuses_the_batch",
     "S6": "session::a_weak_table_is_refused",
@@ -108,7 +108,7 @@ PROMISES: dict[str, str] = {
     "G4": "mcap_stream::cut_everywhere mcap_stream::ten_thousand_bits_flipped",
     "G5": "mcap_conformance::reader mcap_conformance::writer",
     "G6": "fuzz::mutants_raise_what_they_should fuzz::mutants_for_longer",
-    "G9": "acknowledged::g9_ten_robots_at_40_hz",
+    "G9": "acknowledged::ten_robots_at_40_hz_are_acknowledged acknowledged::g9_ten_robots_at_40_hz",
     "G10": "soak::g10_a_few_laps soak::g10_four_robot_hours",
     "G13": "faults_live::g13_viewers faults_live::g13_viewers_for_a_minute",
     "G14": "stalls::g14_the_service_stalls stalls::g14_the_network_fails_for_a_minute",
