@@ -19,6 +19,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from facet.mapping.settings import MapSettings
+from facet.warmup import warm_up
 from facet_protocol.messages import Envelope
 from test_kills import NUM_ROBOTS, RATE_HZ, Robots, Victim, small_scans
 
@@ -133,7 +135,9 @@ def test_ten_robots_at_40_hz_are_acknowledged(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 def test_g9_ten_robots_at_40_hz(tmp_path: Path) -> None:
-    """p99 150 ms, at most 500 ms, on a quiet disk: what this disk takes for itself comes on top."""
+    """p99 150 ms, at most 500 ms, on a quiet disk: what this disk takes for itself comes on top.
+    With kernels that are compiled: the very first start takes a processor for a minute."""
+    warm_up(MapSettings())
     took, disk = acknowledged(tmp_path, 6.0)
     assert len(took) > 0.9 * 6.0 / MESSAGE_S
     p99, of_disk = np.percentile(took, 99), np.percentile(disk, 99)
@@ -209,5 +213,6 @@ def test_a_flood_keeps_no_one_out(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_s4_a_flood_delays_no_one(tmp_path: Path) -> None:
     """p99 at most twice what it was."""
+    warm_up(MapSettings())
     quiet, beside = (np.percentile(own, 99) for own in beside_a_flood(tmp_path, 4.0))
     assert beside <= 2.0 * quiet, f"{quiet:.0f} ms, beside the flood {beside:.0f} ms"
