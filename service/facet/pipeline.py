@@ -8,8 +8,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
 from facet.admission import Admission, Moved, Outcome
-from facet.mapping.mapper import Mapper
-from facet.mapping.quantise import quantise
+from facet.mapping.mapper import Counted, Mapper
 from facet.outgoing import Outgoing
 from facet.placement import Admitted
 from facet.sinks import Message, Sink
@@ -135,8 +134,7 @@ class Pipeline:
 
     def _erase(self, scan: Scan) -> None:
         """Take a scan out, exactly. It was applied; its points are none of the map's any more."""
-        num = len(quantise(scan, self._mapper.settings).points)
-        self._mapper.retract(scan)
+        num = self._mapper.retract(scan).points_stored
         points = {"points_stored": -num, "points_rejected.erased": num}
         self._account.settle(scan.source, "scans_erased", 0, {"scans_erased": 1, **points})
 
@@ -145,11 +143,9 @@ class Pipeline:
 
         What is in them of a scan that is taken out goes with it, so that points in = stored +
         rejected holds, and each of them, of the scans that are in the map."""
-        out = quantise(old, self._mapper.settings)
-        self._mapper.retract(old)
-        inserted = self._mapper.insert(new)
-        changes = Counter(_points(new, inserted.points_stored, inserted.rejected))
-        changes.subtract(_points(old, len(out.points), out.rejected))
+        taken_out, inserted = self._mapper.retract(old), self._mapper.insert(new)
+        changes = Counter(_points(new, inserted))
+        changes.subtract(_points(old, taken_out))
         return dict(changes)
 
     def _take(self, admitted: Admitted) -> None:
@@ -158,8 +154,7 @@ class Pipeline:
             self._account.settle(scan.source, "conflict", also=self._exchange(replaced, scan))
             self._replaced += [record for record in records if isinstance(record, Conflict)]
         else:
-            inserted = self._mapper.insert(scan)
-            points = _points(scan, inserted.points_stored, inserted.rejected)
+            points = _points(scan, self._mapper.insert(scan))
             self._account.settle(scan.source, "applied", also=points)
         previous = self._applied.get(scan.source)
         num_scans = (previous.num_scans if previous else 0) + 1
@@ -227,12 +222,12 @@ class Pipeline:
                 sink.write(envelope, message)
 
 
-def _points(scan: Scan, points_stored: int, rejected: dict[str, int]) -> dict[str, int]:
+def _points(scan: Scan, counted: Counted) -> dict[str, int]:
     """What the points of a scan are counted under: points in = stored + rejected."""
-    lost = Counter(rejected) + Counter(scan.ignored)
+    lost = Counter(counted.rejected) + Counter(scan.ignored)
     points = {f"points_rejected.{reason}": num for reason, num in lost.items()}
     points["points_in"] = len(scan.points) + sum(scan.ignored.values())
-    points["points_stored"] = points_stored
+    points["points_stored"] = counted.points_stored
     return points
 
 

@@ -35,8 +35,8 @@ Timer = Callable[[str], None]
 TileIndex = tuple[int, int, int]
 
 
-class Inserted(NamedTuple):
-    """What became of a scan's points."""
+class Counted(NamedTuple):
+    """What became of a scan's points, or had."""
 
     points_stored: int
     rejected: dict[str, int]
@@ -86,7 +86,7 @@ class Mapper:
         self._planes = group_planes(self._table, limits(self.settings, 0.0), self.settings)
         self._stamp_ns = 0
 
-    def insert(self, scan: Scan) -> Inserted:
+    def insert(self, scan: Scan) -> Counted:
         """Add a resolved scan. What cannot be mapped is counted, never lost in silence."""
         ticks = quantise(scan, self.settings)
         self._store.insert(ticks)
@@ -94,14 +94,15 @@ class Mapper:
         self._witness.note(ticks, scan)
         self._census.count(scan, ticks, 1)
         self._stamp_ns = max(self._stamp_ns, scan.stamp_ns)
-        return Inserted(len(ticks.points), ticks.rejected)
+        return Counted(len(ticks.points), ticks.rejected)
 
-    def retract(self, scan: Scan) -> None:
+    def retract(self, scan: Scan) -> Counted:
         """Take a scan out again, exactly as if it had never been there (design 3.7)."""
         ticks = quantise(scan, self.settings)
         self._store.remove(ticks)
         self._free.remove(ticks)
         self._census.count(scan, ticks, -1)
+        return Counted(len(ticks.points), ticks.rejected)
 
     def update(self, timer: Timer | None = None) -> MapUpdate:
         """Derive everything that is stale. `timer` is told the name of each stage as it ends."""
