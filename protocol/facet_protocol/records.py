@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import Field, fields
+from typing import Any, ClassVar, Protocol, TypeVar
+
 from facet_protocol.messages import (
     Conflict,
     Corrected,
@@ -18,6 +22,14 @@ from facet_protocol.messages import (
 from facet_protocol.proto import service_pb2 as pb
 from facet_protocol.wire import check_pose, parse
 
+
+class _Record(Protocol):
+    """Any dataclass."""
+
+    __dataclass_fields__: ClassVar[dict[str, Field[Any]]]
+
+
+R = TypeVar("R", bound=_Record)
 HEALTH = ("OK", "DEGRADED", "FAIL")
 
 
@@ -56,23 +68,6 @@ def decode_status(payload: bytes | memoryview) -> Status:
     )
 
 
-def encode_cut(cut: Cut) -> bytes:
-    return pb.Cut(
-        revision=cut.revision,
-        robot=cut.robot,
-        sensor=cut.sensor,
-        epoch=cut.epoch,
-        sequence=cut.sequence,
-        stamp_ns=cut.stamp_ns,
-        num_scans=cut.num_scans,
-    ).SerializeToString(deterministic=True)
-
-
-def decode_cut(payload: bytes | memoryview) -> Cut:
-    m = parse(pb.Cut, payload)
-    return Cut(m.revision, m.robot, m.sensor, m.epoch, m.sequence, m.stamp_ns, m.num_scans)
-
-
 def encode_resolved(resolved: ResolvedPose) -> bytes:
     return pb.ResolvedPose(
         robot=resolved.robot,
@@ -107,68 +102,25 @@ def decode_correction(payload: bytes | memoryview) -> Correction:
     return Correction(m.robot, tuple(poses))
 
 
-def encode_corrected(corrected: Corrected) -> bytes:
-    return pb.Corrected(
-        robot=corrected.robot,
-        epoch=corrected.epoch,
-        sequence=corrected.sequence,
-        stamp_ns=corrected.stamp_ns,
-        num_scans=corrected.num_scans,
-        reason=corrected.reason,
-    ).SerializeToString(deterministic=True)
+def _plain(
+    record: type[R], message: type[Any]
+) -> tuple[Callable[[R], bytes], Callable[[bytes | memoryview], R]]:
+    """Encoder and decoder of a record whose fields are those of its message, by name."""
+    names = [field.name for field in fields(record)]
+
+    def encode(one: R) -> bytes:
+        values = {name: getattr(one, name) for name in names}
+        return bytes(message(**values).SerializeToString(deterministic=True))
+
+    def decode(payload: bytes | memoryview) -> R:
+        m = parse(message, payload)
+        return record(**{name: getattr(m, name) for name in names})
+
+    return encode, decode
 
 
-def decode_corrected(payload: bytes | memoryview) -> Corrected:
-    m = parse(pb.Corrected, payload)
-    return Corrected(m.robot, m.epoch, m.sequence, m.stamp_ns, m.num_scans, m.reason)
-
-
-def encode_conflict(conflict: Conflict) -> bytes:
-    return pb.Conflict(
-        robot=conflict.robot,
-        sensor=conflict.sensor,
-        epoch=conflict.epoch,
-        sequence=conflict.sequence,
-        stamp_ns=conflict.stamp_ns,
-        kept=conflict.kept,
-        left_out=conflict.left_out,
-        replaced=conflict.replaced,
-    ).SerializeToString(deterministic=True)
-
-
-def decode_conflict(payload: bytes | memoryview) -> Conflict:
-    m = parse(pb.Conflict, payload)
-    numbers = (m.epoch, m.sequence, m.stamp_ns)
-    return Conflict(m.robot, m.sensor, *numbers, m.kept, m.left_out, m.replaced)
-
-
-def encode_erase(erase: Erase) -> bytes:
-    return pb.Erase(
-        robot=erase.robot,
-        sensor=erase.sensor,
-        epoch=erase.epoch,
-        first=erase.first,
-        last=erase.last,
-    ).SerializeToString(deterministic=True)
-
-
-def decode_erase(payload: bytes | memoryview) -> Erase:
-    m = parse(pb.Erase, payload)
-    return Erase(m.robot, m.sensor, m.epoch, m.first, m.last)
-
-
-def encode_loss(loss: Loss) -> bytes:
-    return pb.Loss(
-        robot=loss.robot,
-        sensor=loss.sensor,
-        epoch=loss.epoch,
-        first_sequence=loss.first_sequence,
-        count=loss.count,
-        reason=loss.reason,
-        stamp_ns=loss.stamp_ns,
-    ).SerializeToString(deterministic=True)
-
-
-def decode_loss(payload: bytes | memoryview) -> Loss:
-    m = parse(pb.Loss, payload)
-    return Loss(m.robot, m.sensor, m.epoch, m.first_sequence, m.count, m.reason, m.stamp_ns)
+encode_cut, decode_cut = _plain(Cut, pb.Cut)
+encode_corrected, decode_corrected = _plain(Corrected, pb.Corrected)
+encode_conflict, decode_conflict = _plain(Conflict, pb.Conflict)
+encode_erase, decode_erase = _plain(Erase, pb.Erase)
+encode_loss, decode_loss = _plain(Loss, pb.Loss)
