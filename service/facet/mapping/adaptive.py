@@ -154,16 +154,15 @@ def estimate(halo, margin, local, seen, rule, scratch):  # type: ignore[no-untyp
     beside = kind == THICK and tan_gamma <= rule.tan_theta  # a plane, not on it: a noise shell
     if kind != ALIGNED and (outlier or beside):
         return THICK, 0, 0, 0, 255, False, reach
-    cx, cy, cz = seen & 15, (seen >> 4) & 15, (seen >> 8) & 15
+    region = votes, count, r, seen, one_pose
     first = r  # radius of the region of the first normal: smaller where the full one is thick
     while kind != ALIGNED:
         passes = 1 if kind == VALID else rule.passes
-        for _ in range(passes):  # look again: its own side, by the normal, and its own slab
-            own = nx * cx + ny * cy + nz * cz
-            within_slab(votes, count, r, nx, ny, nz, own, rule.slab, sums)
-            if sums[0] < rule.sparse:
-                return SPARSE, 0, 0, 0, 0, False, reach
-            kind, nx, ny, nz, tan_gamma = _classify(sums, seen, one_pose, rule)
+        kind, nx, ny, nz, tan_gamma = _look_again(
+            region, nx, ny, nz, rule.slab, passes, rule.sparse, rule, sums
+        )
+        if kind == SPARSE:
+            return SPARSE, 0, 0, 0, 0, False, reach
         first -= 1
         if kind == VALID or first < max(1, r - rule.shrink):
             break
@@ -175,12 +174,12 @@ def estimate(halo, margin, local, seen, rule, scratch):  # type: ignore[no-untyp
     dense = sums[1] >= rule.thin_points * sums[0]  # centroids are sure enough for a thinner slab
     nearly = kind == THICK and tan_gamma < rule.tan_mixed < whole
     if nearly and dense and r > 1:  # a step: a narrow face between two
-        for _ in range(rule.thin_passes):
-            own = nx * cx + ny * cy + nz * cz
-            within_slab(votes, count, r, nx, ny, nz, own, rule.thin_slab, sums)
-            if rule.thin_share * sums[0] < every:  # a slice of a lump
-                return THICK, 0, 0, 0, 255, False, reach
-            kind, nx, ny, nz, tan_gamma = _classify(sums, seen, one_pose, rule)
+        least = (every + rule.thin_share - 1) // rule.thin_share
+        kind, nx, ny, nz, tan_gamma = _look_again(
+            region, nx, ny, nz, rule.thin_slab, rule.thin_passes, least, rule, sums
+        )
+        if kind == SPARSE:  # a slice of a lump
+            return THICK, 0, 0, 0, 255, False, reach
     if kind == VALID and (seen >> 31) & 1 == 1 and _towards(seen, nx, ny, nz) < 4.0:
         kind = MIXED  # both sides of a thin thing, not one side from two directions
     half_degrees = np.int64(np.floor(np.arctan(tan_gamma) * 114.59155902616465 + 0.5))
@@ -193,6 +192,22 @@ def estimate(halo, margin, local, seen, rule, scratch):  # type: ignore[no-untyp
         _at_border(sums, seen, r, nx, ny, nz, rule),
         reach,
     )
+
+
+@kernel
+def _look_again(region, nx, ny, nz, slab, passes, least, rule, sums):  # type: ignore[no-untyped-def]
+    """Class and normal again, and again: of the votes on the voxel's own side, by the last normal,
+    and in its own slab; SPARSE where these are fewer than `least`."""
+    votes, count, r, seen, one_pose = region
+    cx, cy, cz = seen & 15, (seen >> 4) & 15, (seen >> 8) & 15
+    kind, tan_gamma = SPARSE, 0.0
+    for _ in range(passes):
+        own = nx * cx + ny * cy + nz * cz
+        within_slab(votes, count, r, nx, ny, nz, own, slab, sums)
+        if sums[0] < least:
+            return SPARSE, nx, ny, nz, 0.0
+        kind, nx, ny, nz, tan_gamma = _classify(sums, seen, one_pose, rule)
+    return kind, nx, ny, nz, tan_gamma
 
 
 @kernel
