@@ -17,14 +17,14 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from facet.mapping.blocks import unpack
 from facet.mapping.eigen import eigenvector, smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.merging import Nodes
 from facet.mapping.normals import UNIT, NormalField
 from facet.mapping.patches import PatchField
+from facet.mapping.planes import Table
 from facet.mapping.settings import STEPS, MapSettings
-from facet.mapping.store import VoxelStore
+from facet.mapping.store import VoxelStore, centroid
 from facet.mapping.tiles import TileField
 
 SUMS = 22  # n; sum x (3), xx (6); sum u (3), u x (9): x in 1/8 voxels, u normals times UNIT
@@ -47,69 +47,53 @@ def _is_pure(normals, patches, row):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _place(store, row, origin, x):  # type: ignore[no-untyped-def]
-    """A voxel's rounded centroid from an origin, 1/8 voxels, into x (3,)."""
+def _add_members(store, normals, patches, rows, plane_of, origin, sums):  # type: ignore[no-untyped-def]
+    """Add pure members, rows (M,) of the planes plane_of (M,), to the sums (K, SUMS) of these."""
     blocks, columns = store
-    seen, local = columns.observable[row], np.int64(columns.local[row])
-    bi, bj, bk = unpack(blocks.keys[columns.block[row]])
-    x[0] = STEPS * (8 * bi + (local & 7)) + (seen & 15) - origin[0]
-    x[1] = STEPS * (8 * bj + ((local >> 3) & 7)) + ((seen >> 4) & 15) - origin[1]
-    x[2] = STEPS * (8 * bk + (local >> 6)) + ((seen >> 8) & 15) - origin[2]
-
-
-@kernel
-def _add_members(store, normals, patches, members, plane_of, origin, sums):  # type: ignore[no-untyped-def]
-    """Add a tile's pure members (rows, corner, starts) to the sums (K, SUMS) of their planes;
-    plane_of (T,), -1: none."""
-    rows, corner, starts = members
     x = np.empty(3, np.int64)
-    for plane in range(plane_of.shape[0]):
-        k = plane_of[plane]
-        for m in range(starts[plane], starts[plane + 1] if k >= 0 else 0):
-            row = rows[m]
-            if corner[m] or not _is_pure(normals, patches, row):
-                continue
-            _place(store, row, origin[k], x)
-            sums[k, 0] += 1
-            s = 4
-            for a in range(3):
-                sums[k, 1 + a] += x[a]
-                sums[k, 10 + a] += normals.unit[row, a]
-                for b in range(a, 3):
-                    sums[k, s] += x[a] * x[b]
-                    s += 1
-                for b in range(3):
-                    sums[k, 13 + 3 * a + b] += normals.unit[row, a] * x[b]
+    for m in range(rows.shape[0]):
+        row, k = rows[m], plane_of[m]
+        if not _is_pure(normals, patches, row):
+            continue
+        x[0], x[1], x[2] = centroid(blocks, columns, row)
+        sums[k, 0] += 1
+        s = 4
+        for a in range(3):
+            x[a] -= origin[k, a]
+        for a in range(3):
+            sums[k, 1 + a] += x[a]
+            sums[k, 10 + a] += normals.unit[row, a]
+            for b in range(a, 3):
+                sums[k, s] += x[a] * x[b]
+                s += 1
+            for b in range(3):
+                sums[k, 13 + 3 * a + b] += normals.unit[row, a] * x[b]
 
 
 @kernel
-def _add_heights(store, normals, patches, members, plane_of, origin, axes, pure, sums):  # type: ignore[no-untyped-def]
+def _add_heights(store, normals, patches, rows, plane_of, origin, axes, pure, sums):  # type: ignore[no-untyped-def]
     """Likewise add to sums (K, ARC) where members are across the strip, and how far off its plane.
     axes: (K, 6) unit vectors across it and along its normal; pure: (K,) of pure members alone."""
-    rows, corner, starts = members
-    x = np.empty(3, np.int64)
-    for plane in range(plane_of.shape[0]):
-        k = plane_of[plane]
-        for m in range(starts[plane], starts[plane + 1] if k >= 0 else 0):
-            row = rows[m]
-            if corner[m] or patches.member[row] < 0:
-                continue
-            if pure[k] and not _is_pure(normals, patches, row):
-                continue
-            _place(store, row, origin[k], x)
-            u = axes[k]
-            s = np.int64(np.floor(u[0] * x[0] + u[1] * x[1] + u[2] * x[2] + 0.5))
-            h = np.int64(np.floor(8.0 * (u[3] * x[0] + u[4] * x[1] + u[5] * x[2]) + 0.5))
-            ss = s * s
-            sums[k, 0] += 1
-            sums[k, 1] += s
-            sums[k, 2] += ss
-            sums[k, 3] += ss * s
-            sums[k, 4] += ss * ss
-            sums[k, 5] += h
-            sums[k, 6] += h * h
-            sums[k, 7] += h * s
-            sums[k, 8] += h * ss
+    blocks, columns = store
+    for m in range(rows.shape[0]):
+        row, k = rows[m], plane_of[m]
+        if patches.member[row] < 0 or (pure[k] and not _is_pure(normals, patches, row)):
+            continue
+        x, y, z = centroid(blocks, columns, row)
+        x, y, z = x - origin[k, 0], y - origin[k, 1], z - origin[k, 2]
+        u = axes[k]
+        s = np.int64(np.floor(u[0] * x + u[1] * y + u[2] * z + 0.5))
+        h = np.int64(np.floor(8.0 * (u[3] * x + u[4] * y + u[5] * z) + 0.5))
+        ss = s * s
+        sums[k, 0] += 1
+        sums[k, 1] += s
+        sums[k, 2] += ss
+        sums[k, 3] += ss * s
+        sums[k, 4] += ss * ss
+        sums[k, 5] += h
+        sums[k, 6] += h * h
+        sums[k, 7] += h * s
+        sums[k, 8] += h * ss
 
 
 class Turn(NamedTuple):
@@ -214,20 +198,20 @@ class Bends:
 
     def flat(
         self,
-        tile_keys: NDArray[np.int64],
-        starts: NDArray[np.int64],
+        table: Table,
         label: NDArray[np.int64],
         nodes: Nodes,
+        occupation: NDArray[np.int64],
     ) -> NDArray[np.bool_]:
         """(K,) whether a plane is wide enough to be one and, if it is a strip, not bent.
 
-        label: (T,) plane of each tile-plane, in the order of tile_keys and starts."""
+        label: (T,) plane of each tile-plane of the table; nodes, occupation: of the K planes."""
         widths, lengths = _spans(nodes.votes, nodes.scatter).T
         flat = widths >= self._settings.min_width
         strips = flat & (widths < self._settings.strip_width)
         origin = np.floor(nodes.mean * STEPS).astype(np.int64)
         sums = np.zeros((len(strips), SUMS), np.int64)
-        self._sum(_add_members, tile_keys, starts, label, strips, origin, sums)
+        self._sum(_add_members, table, label, strips, origin, sums)
         limit = np.radians(self._settings.bend_deg)
         arcs: dict[int, Turn] = {}
         turns = _turns(sums)
@@ -241,12 +225,12 @@ class Bends:
                 arcs[plane] = across
         axes = np.zeros((len(origin), 6))
         pure = np.isin(np.arange(len(origin)), list(arcs))
-        held = self._occupation(tile_keys, label, len(origin))
-        thin = strips & flat & ~pure & (widths >= GAP_WIDTH) & (held < FULL * widths * lengths)
+        hollow = occupation < FULL * widths * lengths
+        thin = strips & flat & ~pure & (widths >= GAP_WIDTH) & hollow
         for plane in np.flatnonzero(pure | thin).tolist():
             axes[plane] = arcs[plane].axes if pure[plane] else _axes(nodes.scatter[plane])
         heights = np.zeros((len(origin), ARC), np.int64)
-        self._sum(_add_heights, tile_keys, starts, label, pure | thin, origin, axes, pure, heights)
+        self._sum(_add_heights, table, label, pure | thin, origin, axes, pure, heights)
         for plane, across in arcs.items():
             angle, deviation = _arc(heights[plane], across.width)
             least = max(np.radians(ARC_DEG), ARC_SIGMAS * deviation)
@@ -255,20 +239,10 @@ class Bends:
             flat[plane] = _bimodality(heights[plane]) < EMPTY
         return np.asarray(flat)
 
-    def _occupation(
-        self, tile_keys: NDArray[np.int64], label: NDArray[np.int64], count: int
-    ) -> NDArray[np.float64]:
-        """(K,) voxels of each plane."""
-        own = [self._tiles.tiles[key].occupation for key in tile_keys.tolist()]
-        on = label >= 0
-        weights = np.concatenate([np.zeros(0, np.int64), *own])[on]
-        return np.bincount(label[on], weights, minlength=count).astype(np.float64)
-
     def _sum(
         self,
         add: Callable[..., None],
-        tile_keys: NDArray[np.int64],
-        starts: NDArray[np.int64],
+        table: Table,
         label: NDArray[np.int64],
         asked: NDArray[np.bool_],
         *arguments: NDArray[Any],
@@ -276,16 +250,15 @@ class Bends:
         """Hand the members of the planes that are `asked` for (K,) to `add`, all at once."""
         held = np.flatnonzero(label >= 0)
         nodes = held[asked[label[held]]]
-        if not len(nodes):
-            return
-        at = np.searchsorted(starts, nodes, side="right") - 1
-        tiles = [self._tiles.tiles[key] for key in tile_keys[at].tolist()]
-        numbers = (nodes - starts[at]).tolist()
-        parts = [slice(*t.starts[n : n + 2]) for t, n in zip(tiles, numbers, strict=True)]
-        rows = [tile.rows[part] for tile, part in zip(tiles, parts, strict=True)]
-        corner = [tile.corner[part] for tile, part in zip(tiles, parts, strict=True)]
-        ends = np.concatenate([[0], np.cumsum([len(own) for own in rows])]).astype(np.int64)
-        members = np.concatenate(rows), np.concatenate(corner), ends
+        at = table.tile_of[nodes]
+        own = [
+            self._tiles.tiles[key].members_of(number)
+            for key, number in zip(
+                table.tile_keys[at].tolist(), (nodes - table.starts[at]).tolist(), strict=True
+            )
+        ]
+        rows = np.concatenate([np.zeros(0, np.int32), *own])
+        plane_of = np.repeat(label[nodes], [len(members) for members in own])
         store = self._store.blocks, self._store.columns
         normals, patches = self._normals.normals, self._patches.patches
-        add(store, normals, patches, members, label[nodes], *arguments)
+        add(store, normals, patches, rows, plane_of, *arguments)

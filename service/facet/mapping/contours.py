@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
@@ -9,12 +10,12 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from facet.mapping.blocks import unpack
 from facet.mapping.kernel import kernel
 from facet.mapping.pivot import CELLS, HALO, SIDE, boundary_edges, mark_changes
 from facet.mapping.rings import Outline, surfaces_of
+from facet.mapping.runs import deal, starts_of
 from facet.mapping.settings import STEPS, MapSettings
-from facet.mapping.store import VoxelStore
+from facet.mapping.store import VoxelStore, centroid
 from facet.mapping.tiles import Tile
 from facet_protocol.messages import PlaneFrame
 
@@ -22,7 +23,6 @@ UnitNormal = tuple[int, int, int]
 FRAME_UNIT = 32  # a frame's normal is rounded to 1/32 a component: it moves rarely
 SIZE = CELLS * STEPS  # grid units of a (u, v) tile's edge
 PLACES = 64  # (u, v) tiles that a tile-plane falls into, at most
-PARTS = 16  # that tile-planes are dealt out in; threads take them
 Place = tuple[int, int]  # of a (u, v) tile
 
 
@@ -46,13 +46,7 @@ def make_frame(rounded: UnitNormal, voxel_m: float) -> PlaneFrame:
 def _project(rows, blocks, columns, axes, out):  # type: ignore[no-untyped-def]
     """(u, v) in grid units of voxels, into out (N, 2)."""
     for m in range(rows.shape[0]):
-        row = rows[m]
-        i, j, k = unpack(blocks.keys[columns.block[row]])
-        local = np.int64(columns.local[row])
-        seen = columns.observable[row]
-        x = 64 * i + 8 * (local & 7) + (seen & 15)
-        y = 64 * j + 8 * ((local >> 3) & 7) + ((seen >> 4) & 15)
-        z = 64 * k + 8 * (local >> 6) + ((seen >> 8) & 15)
+        x, y, z = centroid(blocks, columns, rows[m])
         out[m, 0] = np.floor(x * axes[0, 0] + y * axes[0, 1] + z * axes[0, 2] + 0.5)
         out[m, 1] = np.floor(x * axes[1, 0] + y * axes[1, 1] + z * axes[1, 2] + 0.5)
 
@@ -169,7 +163,7 @@ class ContourField:
         for gone in self.contours.keys() - normals.keys():
             del self.contours[gone]
         wanted = self._reframe(normals, changed)
-        stale: dict[int, set[Place]] = {plane_id: set() for plane_id, _, _ in wanted}
+        stale: defaultdict[int, set[Place]] = defaultdict(set)
         for key in sorted(changed):
             tile = tiles[key]
             ids = tile.ids.tolist() if tile.num_planes else []
@@ -178,15 +172,13 @@ class ContourField:
                 contour = self.contours.get(plane_id)
                 share = contour.shares.pop((key, t), None) if contour else None
                 if share is not None:
-                    stale.setdefault(plane_id, set()).update(share.places)
+                    stale[plane_id] |= share.places
             self._owners[key] = stays
             wanted.extend((plane_id, key, t) for plane_id, t in stays)
         for (plane_id, key, t), share in zip(
             wanted, self._shares(store, tiles, wanted), strict=True
         ):
-            stale.setdefault(plane_id, set()).update(
-                _exchange(self.contours[plane_id].shares, (key, t), share)
-            )
+            stale[plane_id] |= _exchange(self.contours[plane_id].shares, (key, t), share)
         return self._redraw(stale)
 
     def _reframe(
@@ -209,17 +201,15 @@ class ContourField:
     ) -> list[Share]:
         """What tile-planes give to the outlines of their planes."""
         own = [tiles[key].rows_of(t) for _, key, t in wanted]
-        starts = np.concatenate([[0], np.cumsum([len(rows) for rows in own])]).astype(np.int64)
+        starts = starts_of([len(rows) for rows in own])
         rows = np.concatenate([np.zeros(0, np.int32), *own])
         frames = [self.contours[plane_id].frame for plane_id, _, _ in wanted]
         axes = np.array([(f.axis_u, f.axis_v) for f in frames], float).reshape(-1, 2, 3)
         points = np.empty((len(rows), 2), np.int16)
         corners = np.zeros((len(wanted), 2), np.int32)
         places, counts = np.empty((len(wanted), PLACES), np.int64), np.empty(len(wanted), np.int64)
-        parts = np.searchsorted(starts, np.linspace(0, starts[-1], PARTS + 1))
-        parts[-1] = len(wanted)
         _share_all(
-            rows, starts, parts, store.blocks, store.columns, axes, points, corners, places,
+            rows, starts, deal(starts), store.blocks, store.columns, axes, points, corners, places,
             counts,
         )  # fmt: skip
         ends = starts.tolist()

@@ -11,6 +11,7 @@ from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.merging import plane_of
 from facet.mapping.settings import BLOCK, STEPS, TILE
+from facet.mapping.store import centroid
 from facet.mapping.sums import SUMS, count_points, read_sums, shift_moments
 
 STRAY = 0.47  # voxels: a voxel whose centroid is so far off its tile-plane is not fitted to
@@ -187,11 +188,8 @@ def _settled(own, blocks, columns, border, second, tile_key, plane):  # type: ig
             row = rows[m]
             if corner[m] or border[row] or second[row] >= 0:
                 continue
-            i, j, k = unpack(blocks.keys[columns.block[row]])
-            seen, local = columns.observable[row], np.int64(columns.local[row])
-            a = STEPS * (BLOCK * i - TILE * ti + (local & 7)) + (seen & 15)
-            b = STEPS * (BLOCK * j - TILE * tj + ((local >> 3) & 7)) + ((seen >> 4) & 15)
-            c = STEPS * (BLOCK * k - TILE * tk + (local >> 6)) + ((seen >> 8) & 15)
+            a, b, c = centroid(blocks, columns, row)
+            a, b, c = a - STEPS * TILE * ti, b - STEPS * TILE * tj, c - STEPS * TILE * tk
             pure += 1
             if abs((nx * a + ny * b + nz * c) / STEPS - offset) > CORE:
                 continue

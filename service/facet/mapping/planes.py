@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from facet.mapping.blocks import unpack_all
 from facet.mapping.kernel import kernel
 from facet.mapping.merging import Limits, Nodes, merge_nodes, plane_of, pool
+from facet.mapping.runs import starts_of
 from facet.mapping.settings import TICKS, TILE, MapSettings
 from facet.mapping.tiles import Tile, ends_of
 
@@ -24,9 +25,7 @@ FREE = -1
 ENOUGH_POINTS = 200  # pure points that a plane is fitted to
 
 
-Judge = Callable[
-    [NDArray[np.int64], NDArray[np.int64], NDArray[np.int64], Nodes], NDArray[np.bool_]
-]
+Judge = Callable[["Table", NDArray[np.int64], Nodes, NDArray[np.int64]], NDArray[np.bool_]]
 
 
 class Table(NamedTuple):
@@ -71,7 +70,7 @@ def tabulate(tiles: dict[int, Tile]) -> Table:
     keys = np.array(sorted(k for k, t in tiles.items() if t.num_planes), np.int64)
     ordered = [tiles[int(k)] for k in keys]
     counts = np.array([t.num_planes for t in ordered], np.int64)
-    starts = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    starts = starts_of(counts)
     if not ordered:
         none = Nodes(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 6)), np.zeros((0, 3)))
         empty = np.zeros(0, np.int64)
@@ -110,7 +109,7 @@ def group_planes(
     keep &= nodes.votes >= settings.member_share * least  # leftovers alone make no plane
     stages.min_occupation = least
     if flat is not None:
-        keep[keep] = flat(table.tile_keys, table.starts, *_drop(label, nodes, keep))
+        keep[keep] = flat(table, *_drop(label, nodes, keep), occupation[keep])
     stages.detailed = int(keep.sum())
     label, nodes = _drop(label, nodes, keep)
 

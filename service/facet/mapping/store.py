@@ -12,11 +12,21 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from facet.mapping.blocks import Blocks, add_block, find, pack, put_row, rehash, row_at, unpack_all
+from facet.mapping.blocks import (
+    Blocks,
+    add_block,
+    find,
+    pack,
+    put_row,
+    rehash,
+    row_at,
+    unpack,
+    unpack_all,
+)
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory, copied, grow_all
 from facet.mapping.quantise import VIEW, Ticks
-from facet.mapping.settings import BLOCK, TICKS
+from facet.mapping.settings import BLOCK, STEPS, TICKS
 from facet.mapping.sums import (
     DEEP,
     MOMENTS,
@@ -170,6 +180,18 @@ def _settle(blocks, columns, touched_rows, num_touched, dirty_rows):  # type: ig
         dirty_rows[num_dirty] = row
         num_dirty += 1
     return num_dirty
+
+
+@kernel
+def centroid(blocks, columns, row):  # type: ignore[no-untyped-def]
+    """x, y, z of a voxel's rounded centroid, 1/8 voxels, whole."""
+    i, j, k = unpack(blocks.keys[columns.block[row]])
+    seen, local = columns.observable[row], np.int64(columns.local[row])
+    return (
+        STEPS * (BLOCK * i + (local & 7)) + (seen & 15),
+        STEPS * (BLOCK * j + ((local >> 3) & 7)) + ((seen >> 4) & 15),
+        STEPS * (BLOCK * k + (local >> 6)) + ((seen >> 8) & 15),
+    )
 
 
 @kernel

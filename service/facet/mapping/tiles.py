@@ -7,7 +7,6 @@ their tile-plane, never the plane, so a merge of planes relabels nothing.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,10 +26,13 @@ from facet.mapping.memory import Heap, Memory
 from facet.mapping.merging import Limits, Nodes
 from facet.mapping.normals import Normals
 from facet.mapping.patches import PER_BLOCK, PatchField
+from facet.mapping.runs import deal, starts_of
 from facet.mapping.store import Touched, VoxelStore
 from facet.mapping.sums import MOMENTS
 
-SHARES = 16  # parts that members are dealt out in; threads take them
+_NO_ROWS, _NO_KEYS = np.zeros(0, np.int32), np.zeros(0, np.int64)
+_STEPS = np.array([pack(n % 3, n // 3 % 3, n // 9) for n in range(27)], np.int64)
+_STEPS -= pack(1, 1, 1)  # from a tile's key to those round it
 
 
 @dataclass(slots=True)
@@ -64,6 +66,11 @@ class Tile:
     def rows_of(self, plane: int) -> NDArray[np.int32]:
         """Voxel rows of one of its tile-planes, a view."""
         return self.rows[self.starts[plane] : self.starts[plane + 1]]
+
+    def members_of(self, plane: int) -> NDArray[np.int32]:
+        """Those of them that belong to no other, a copy."""
+        part = slice(self.starts[plane], self.starts[plane + 1])
+        return self.rows[part][~self.corner[part]]
 
     @property
     def owner(self) -> NDArray[np.int64]:
@@ -128,8 +135,7 @@ class TileField:
             regroup = [int(k) for k in np.unique(tile_keys_of(keys[regrouped]))]
         self._grow(store, patches, regroup, limits)
         others = np.unique(np.concatenate([regrouped, relabelled, moved]))
-        stale = spread(np.array(regroup, np.int64), keys[others])
-        changed = [int(k) for k in stale if int(k) in self.tiles]
+        changed = sorted(self._near(keys[others], np.array(regroup, np.int64)))
         self._fill(store, patches, changed)
         near = self._near(keys[np.unique(store.columns.block[touched.rows])])
         anew = {*changed, *(near if touched.before is None else self._near(keys[turned]))}
@@ -176,14 +182,16 @@ class TileField:
                 self.tiles[key] = _empty_tile(key, members)
         self._num_blocks = count
 
-    def _near(self, block_keys: NDArray[np.int64]) -> set[int]:
-        """Tiles that hold one of the blocks or a neighbour of one."""
-        return self.tiles.keys() & set(spread(_NO_KEYS, block_keys).tolist())
+    def _near(
+        self, block_keys: NDArray[np.int64], tile_keys: NDArray[np.int64] = _NO_KEYS
+    ) -> set[int]:
+        """The tiles, and those that hold one of the blocks or a neighbour of one."""
+        return self.tiles.keys() & set(spread(tile_keys, block_keys).tolist())
 
     def _members(self, keys: list[int]) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
         """Blocks of tiles, one tile after another, and where each begins (N + 1,)."""
         own = [self.tiles[key].blocks for key in keys]
-        return np.concatenate([_NO_ROWS, *own]), _starts([len(blocks) for blocks in own])
+        return np.concatenate([_NO_ROWS, *own]), starts_of([len(blocks) for blocks in own])
 
     def _grow(
         self, store: VoxelStore, patches: PatchField, keys: list[int], limits: Limits
@@ -191,7 +199,7 @@ class TileField:
         """Merge the patches of tiles into tile-planes."""
         members, member_starts = self._members(keys)
         number = patches.patches.number[members].astype(np.int64)
-        first = _starts(number)[member_starts]
+        first = starts_of(number)[member_starts]
         size = int(first[-1])
         nodes = Nodes(np.empty(size), np.empty((size, 3)), np.empty((size, 6)), np.empty((size, 3)))
         index = np.empty(size, np.int16)
@@ -211,7 +219,7 @@ class TileField:
         near, num_near = np.empty((len(keys), SHELL), np.int32), np.empty(len(keys), np.int64)
         room = np.empty(len(keys), np.int64)
         find_shells(store.blocks, tile_keys, near, num_near, room)
-        first = _starts(room)
+        first = starts_of(room)
         rows, corner = np.empty(first[-1], np.int32), np.empty(first[-1], np.bool_)
         most = max((self.tiles[key].num_planes for key in keys), default=0)
         starts = np.empty((len(keys), most + 1), np.int64)
@@ -243,7 +251,7 @@ class TileField:
         tile.heritage = np.stack([tile.ids[old], own, counts[old, own]], axis=1)
         tile.rows, tile.corner, tile.starts = new
         tile.named = False
-        claims = np.concatenate([[0], np.cumsum(corner)])
+        claims = starts_of(corner)
         tile.occupation = np.diff(starts - claims[starts])
 
     def _sum(
@@ -255,18 +263,16 @@ class TileField:
             return
         tile_keys = _tile_keys(tiles)
         nodes = Nodes(*(np.concatenate(c) for c in zip(*(t.nodes for t in tiles), strict=True)))
-        starts = _starts(np.concatenate([np.diff(tile.starts) for tile in tiles]))
+        starts = starts_of(np.concatenate([np.diff(tile.starts) for tile in tiles]))
         points, total = (
             np.empty((len(tile_keys), MOMENTS), np.int64),
             np.empty(len(tile_keys), np.int64),
         )
         planes = np.empty((len(points), 4))
-        shares = np.searchsorted(starts, np.linspace(0, starts[-1], SHARES + 1))
-        shares[-1] = len(points)
         sum_points(
             np.concatenate([tile.rows for tile in tiles]),
             np.concatenate([tile.corner for tile in tiles]),
-            starts, tile_keys, shares, store.blocks, store.columns, normals.border,
+            starts, tile_keys, deal(starts), store.blocks, store.columns, normals.border,
             patches.patches.second, nodes, planes, points, total,
         )  # fmt: skip
         _hand_out(tiles, points, total, planes)
@@ -332,11 +338,6 @@ def ends_of(pairs: NDArray[np.int64], tile_keys: NDArray[np.int64]) -> NDArray[n
     return np.stack([pairs >> 32, other, pairs & 0xFFFF], axis=1)
 
 
-def _starts(sizes: Any) -> NDArray[np.int64]:
-    """(N + 1,) where things of these sizes (N,) begin that lie one after another."""
-    return np.concatenate([[0], np.cumsum(sizes, dtype=np.int64)]).astype(np.int64)
-
-
 def _tile_keys(tiles: list[Tile]) -> NDArray[np.int64]:
     """(T,) keys of the tiles of tile-planes, one tile after another."""
     keys = np.array([tile.key for tile in tiles], np.int64)
@@ -350,15 +351,10 @@ def _hand_out(
     planes: NDArray[np.float64],
 ) -> None:
     """Give tiles the sums of their tile-planes, and what these are near."""
-    ends = np.cumsum([tile.num_planes for tile in tiles]).tolist()
-    for tile, low, high in zip(tiles, [0, *ends], ends, strict=False):
+    starts = starts_of([tile.num_planes for tile in tiles]).tolist()
+    for tile, low, high in zip(tiles, starts, starts[1:], strict=False):
         tile.points, tile.total = points[low:high].copy(), total[low:high].copy()
         tile.planes = planes[low:high].copy()
-
-
-_STEPS = np.array([pack(n % 3, n // 3 % 3, n // 9) for n in range(27)], np.int64)
-_STEPS -= pack(1, 1, 1)  # from a tile's key to those round it
-_NO_ROWS, _NO_KEYS = np.zeros(0, np.int32), np.zeros(0, np.int64)
 
 
 def _empty_tile(key: int, blocks: NDArray[np.int32]) -> Tile:
