@@ -18,12 +18,12 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from facet.sinks.log_file import write_recording
-from facet.sources.mcap_chunk import parse_chunk
-from facet.sources.mcap_stream import LogError, McapStream
+from facet.sources.mcap_chunk import inflate, parse_chunk, records_of
+from facet.sources.mcap_damage import LogError
+from facet.sources.mcap_stream import McapStream
 from facet_protocol.messages import Envelope
 
 HEAD = struct.Struct("<BQ")
-PARSE = parse_chunk
 SEED = 20
 
 
@@ -164,10 +164,8 @@ def test_without_its_checksum_a_chunk_is_believed(
     """The mutant that the test above must kill: a reader that does not look at the CRC."""
     log = whole_log(tmp_path / "a.mcap", 60, "none")
     monkeypatch.setattr(
-        "facet.sources.mcap_chunk.parse_chunk", lambda content: PARSE(content)._replace(crc=0)
-    )
-    monkeypatch.setattr(
-        "facet.sources.mcap_stream.parse_chunk", lambda content: PARSE(content)._replace(crc=0)
+        "facet.sources.mcap_stream.inflate",
+        lambda chunk, content, **told: inflate(chunk._replace(crc=0), content),
     )
     bits = random.Random(SEED).sample(range(8 * len(log.data)), 100)
     with pytest.raises(AssertionError, match="never written"):
@@ -286,6 +284,134 @@ def test_another_definition_of_a_channel_is_damage(tmp_path: Path) -> None:
     assert [m[0] for m in messages] == ["one"]
     assert stream is not None
     assert "channel 1 is not what it was" in stream.damage.notes[0]
+
+
+def packed(compression: str, records: bytes) -> bytes:
+    if compression == "lz4":
+        return bytes(lz4.frame.compress(records))
+    return zstandard.ZstdCompressor().compress(records) if compression else records
+
+
+def unsealed(data: bytes, start: int, end: int) -> bytes:
+    """The log with the CRC of one chunk set to 0, which in MCAP says that it has none, and a bit of
+    its last message changed: everything else is right."""
+    content = data[start + HEAD.size : end]
+    chunk = parse_chunk(content)
+    records = inflate(chunk, content)
+    *_, (_, first, last) = records_of(records)
+    for at in range(first + 22, last):  # the first 22 bytes say which message it is
+        body = packed(chunk.compression, flipped(records, at))
+        if len(body) == chunk.num_bytes:
+            changed = content[:24] + bytes(4) + content[28 : chunk.start] + body
+            return data[: start + HEAD.size] + changed + data[end:]
+    raise AssertionError("no change leaves the chunk as long as it is")
+
+
+def flipped(data: bytes, at: int) -> bytes:
+    return data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :]
+
+
+@pytest.mark.parametrize("compression", ["lz4", "zstd", "none"])
+@pytest.mark.parametrize("number", [0, 1, -1])
+def test_a_chunk_of_ours_that_lost_its_checksum_is_damaged(
+    tmp_path: Path, compression: str, number: int
+) -> None:
+    """MCAP allows a chunk without one; Facet writes none."""
+    log = whole_log(tmp_path / "a.mcap", 60, compression)
+    start, end, _ = log.chunks[number]
+    messages, stream = read(tmp_path / "b.mcap", unsealed(log.data, start, end))
+    ends = [0, *(num for _, _, num in log.chunks)]
+    number %= len(log.chunks)
+    assert messages == log.messages[: ends[number]] + log.messages[ends[number + 1] :]
+    assert stream is not None
+    assert stream.damage.lost_messages == ends[number + 1] - ends[number]
+    assert "wrong checksum" in stream.damage.notes[0]
+    assert stream.num_unchecked == 0
+
+
+@pytest.mark.parametrize("is_metadata_lost", [False, True])
+def test_without_its_header_a_log_of_ours_is_doubted(
+    tmp_path: Path, is_metadata_lost: bool
+) -> None:
+    """One chunk, so that no other tells that there are checksums: the metadata does, or what the
+    summary says of it."""
+    log = whole_log(tmp_path / "a.mcap", 10, "none", 1 << 20)
+    start, end, _ = log.chunks[0]
+    data = unsealed(log.data, start, end)
+    header, metadata = data.index(b"facet"), data.index(b"\x05\0\0\0facet", 33) + 4
+    data = flipped(data, header + 2)
+    if is_metadata_lost:
+        data = flipped(data, metadata + 2)
+    messages, stream = read(tmp_path / "b.mcap", data)
+    assert len(messages) == 10
+    assert stream is not None
+    assert stream.num_unchecked == 10
+    assert stream.damage.is_doubtful
+    assert "10 messages have lost their checksum" in stream.damage.notes[-1]
+
+
+def foreign(path: Path, has_crcs: bool) -> bytes:
+    """Thirty messages in ten chunks, as another writer writes them."""
+    with path.open("wb") as file:
+        writer = Writer(file, compression=CompressionType.NONE, enable_crcs=has_crcs)
+        writer.start()
+        channel = writer.register_channel("topic", "x", 0)
+        for k in range(30):
+            writer.add_message(channel, log_time=k, data=bytes([k] * 40), publish_time=k)
+            if k % 3 == 2:
+                writer.flush()
+        writer.add_metadata("about", {"crc32": "of something else"})
+        writer.finish()
+    return path.read_bytes()
+
+
+def test_a_foreign_log_without_checksums_is_read_as_it_is(tmp_path: Path) -> None:
+    messages, stream = read(tmp_path / "b.mcap", foreign(tmp_path / "a.mcap", has_crcs=False))
+    assert len(messages) == 30
+    assert stream is not None
+    assert not stream.damage
+    assert stream.num_unchecked == 30
+    assert [m.metadata for m in stream.metadata] == [{"crc32": "of something else"}]
+
+
+@pytest.mark.parametrize("number", [0, 4, 9])
+def test_one_chunk_without_a_checksum_among_others_is_doubted(tmp_path: Path, number: int) -> None:
+    """Nobody can tell whether it was written so: it is read, and said."""
+    data = foreign(tmp_path / "a.mcap", has_crcs=True)
+    good, _ = read(tmp_path / "b.mcap", data)
+    with (tmp_path / "a.mcap").open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    index = summary.chunk_indexes[number]
+    end = index.chunk_start_offset + index.chunk_length
+    changed = unsealed(data, index.chunk_start_offset, end)
+    messages, stream = read(tmp_path / "b.mcap", changed)
+    assert len(messages) == 30
+    assert messages != good
+    assert stream is not None
+    assert stream.damage.is_doubtful
+    assert stream.num_unchecked == 3
+
+
+@pytest.mark.parametrize("opcode", [0x8C, 0x0D])
+def test_what_a_log_of_ours_begins_with_is_missed(tmp_path: Path, opcode: int) -> None:
+    """Its settings: without them the same scans give another map. The record is there, and marked
+    as one that no reader has to know. The header tells, or the summary."""
+    log = whole_log(tmp_path / "a.mcap", 10, "lz4")
+    data = bytearray(log.data)
+    record = data.index(b"\x05\0\0\0facet", 33) - HEAD.size
+    assert data[record] == 0x0C
+    data[record] = opcode
+    cut_off = bytes(data[: log.chunks[-1][1]])
+    messages, stream = read(tmp_path / "b.mcap", cut_off)
+    assert messages == log.messages
+    assert stream is not None
+    assert stream.damage.is_doubtful
+    assert any("settings" in note for note in stream.damage.notes)
+    messages, stream = read(tmp_path / "b.mcap", flipped(bytes(data), data.index(b"facet") + 2))
+    assert messages == log.messages
+    assert stream is not None
+    assert "0 records of metadata of 1" in stream.damage.notes[-1]
 
 
 def _u64(data: bytearray, at: int) -> int:

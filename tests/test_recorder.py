@@ -12,7 +12,8 @@ import pytest
 from facet.sinks.durable_file import DurableFile
 from facet.sinks.log_file import write_recording
 from facet.sinks.recorder import Recorder, single_writer
-from facet.sources.mcap_stream import LogError, McapStream
+from facet.sources.mcap_damage import LogError
+from facet.sources.mcap_stream import McapStream
 from facet.sources.recording import Recording
 from facet_protocol.messages import Envelope
 

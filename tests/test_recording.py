@@ -9,7 +9,7 @@ import pytest
 
 from facet.cuts import logged_cuts, timed_cuts
 from facet.sinks.log_file import write_recording
-from facet.sources.mcap_stream import LogError
+from facet.sources.mcap_damage import LogError
 from facet.sources.recording import Recording, is_replayed, paced
 from facet_protocol import topics
 from facet_protocol.codec import encode

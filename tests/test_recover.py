@@ -15,6 +15,7 @@ from facet.sinks.log_file import write_recording
 from facet.sources.mcap_stream import LogMessage, McapStream
 from facet.sources.recording import Recording
 from rig import room
+from test_mcap_stream import foreign, unsealed
 
 
 def facet(*arguments: object) -> tuple[int, str]:
@@ -94,6 +95,38 @@ def test_a_flipped_bit_costs_a_chunk(log: Path, tmp_path: Path) -> None:
     assert f"lost {30 - len(rest)} messages" in text
     assert 0 < len(rest) < 30
     assert facet("info", tmp_path / "clean.mcap")[0] == 0
+
+
+def test_a_chunk_that_lost_its_checksum_is_lost(log: Path, tmp_path: Path) -> None:
+    """MCAP's 0 is none, and allowed; Facet writes no chunk without one."""
+    whole = contents(log)
+    with log.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    index = summary.chunk_indexes[0]
+    end = index.chunk_start_offset + index.chunk_length
+    log.write_bytes(unsealed(log.read_bytes(), index.chunk_start_offset, end))
+    code, text = facet("info", log)
+    assert code == 3
+    assert "wrong checksum" in text
+    assert facet("recover", log, tmp_path / "clean.mcap")[0] == 3
+    rest = contents(tmp_path / "clean.mcap")
+    assert 0 < len(rest) < 30
+    assert rest == whole[-len(rest) :]
+
+
+def test_what_has_no_checksum_is_said(tmp_path: Path) -> None:
+    """A log from elsewhere may be without: nobody can tell whether it is as it was written."""
+    path = tmp_path / "a.mcap"
+    foreign(path, has_crcs=False)
+    code, text = facet("info", path)
+    assert code == 0
+    assert "30 messages that no checksum vouches for" in text
+    code, text = facet("recover", path, tmp_path / "clean.mcap")
+    assert code == 0
+    assert "30 of them are taken on trust" in text
+    foreign(path, has_crcs=True)
+    assert "checksum" not in facet("info", path)[1]
 
 
 def test_nothing_to_recover(tmp_path: Path) -> None:

@@ -14,7 +14,8 @@ from facet.sinks.durable_file import DurableFile
 from facet.sinks.log_file import write_recording
 from facet.sinks.recorder import Recorder
 from facet.sources import mcap_chunk, mcap_stream
-from facet.sources.mcap_stream import LogError, McapStream
+from facet.sources.mcap_damage import LogError
+from facet.sources.mcap_stream import McapStream
 from facet.sources.recording import Recording
 from facet.status import Account
 from fault_rig import Line, around

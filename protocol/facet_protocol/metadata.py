@@ -1,11 +1,14 @@
-"""The checksum that our logs carry with their metadata, for MCAP has none."""
+"""How our logs say whose they are, and the checksum of their metadata, for MCAP has none."""
 
 from __future__ import annotations
 
 import zlib
 from collections.abc import Mapping
 
-METADATA_CRC = "crc32"  # the entry that holds it
+WRITER = "facet"  # in the header of every log that was written by Facet
+RECOVERER = "facet recover"  # and of those that were written again, whoever wrote them first
+OWN_METADATA = "facet"  # the record that a log of Facet's begins with: settings, map, frame
+METADATA_CRC = "crc32"  # the entry that holds the checksum
 
 
 def metadata_crc(entries: Mapping[str, str]) -> str:

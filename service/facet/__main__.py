@@ -20,7 +20,7 @@ from facet.commands.simulate import simulate
 from facet.commands.talk import cmd, status, top
 from facet.commands.terminal import Exit, InputError, err, out
 from facet.config import ConfigError
-from facet.sources.mcap_stream import LogError
+from facet.sources.mcap_damage import LogError
 from facet_protocol.messages import ProtocolError
 
 app = typer.Typer(

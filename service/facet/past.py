@@ -18,8 +18,10 @@ from numpy.typing import NDArray
 
 from facet.sinks.log_file import ChannelName, channel_metadata, schema_text
 from facet.sources.dialects import Dialects
+from facet.sources.mcap_damage import LogError
 from facet.sources.mcap_definitions import Definitions, defined
-from facet.sources.mcap_stream import MAGIC, LogError, McapStream
+from facet.sources.mcap_ends import MAGIC
+from facet.sources.mcap_stream import McapStream
 from facet.sources.naming import is_scan, source_of
 from facet.sources.recording import envelope_of
 from facet_protocol.messages import Envelope, ProtocolError

@@ -40,7 +40,8 @@ from facet.robots import admission_of, dialects_of
 from facet.sinks.log_file import ChannelName
 from facet.sinks.recorder import LogPosition, log_files
 from facet.sources.dialects import Dialects
-from facet.sources.mcap_stream import LogError, McapStream
+from facet.sources.mcap_damage import LogError
+from facet.sources.mcap_stream import McapStream
 from facet.sources.naming import source_of
 from facet.sources.recording import envelope_of, is_replayed
 from facet.status import Account

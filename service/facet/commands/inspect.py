@@ -165,6 +165,8 @@ def _print_contents(recording: Recording, contents: Contents) -> None:
         )
     for reason, num in sorted(contents.losses.items()):
         out.print(f"{num:,} scans {reason}, as the log says itself")
+    if recording.num_unchecked:
+        out.print(f"{recording.num_unchecked:,} messages that no checksum vouches for")
     metadata = recording.metadata.get("facet", {})
     if metadata:
         table("metadata", ("key", "value"), sorted(metadata.items()))

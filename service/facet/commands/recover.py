@@ -63,6 +63,8 @@ def _conclude(stream: McapStream, partial: Path, clean: Path) -> None:
     partial.replace(clean)
     size = megabytes(clean.stat().st_size)
     out.print(f"recovered {stream.num_messages:,} messages into {clean} ({size})")
+    if stream.num_unchecked:
+        out.print(f"{stream.num_unchecked:,} of them are taken on trust: they had no checksum")
     if stream.damage.is_lossy:
         out.print(str(stream.damage))
         raise typer.Exit(Exit.LOST)

@@ -11,7 +11,7 @@ from facet.sinks.durable_file import DurableFile
 from facet_protocol import codec
 from facet_protocol.codec import Message
 from facet_protocol.messages import Envelope, ProtocolError, Scan, TilePoints
-from facet_protocol.metadata import signed
+from facet_protocol.metadata import OWN_METADATA, WRITER, signed
 
 COMPRESSIONS = {
     "lz4": CompressionType.LZ4,
@@ -43,8 +43,8 @@ class LogFile:
             chunk_size=CHUNK_BYTES,
             compression=COMPRESSIONS[compression],
         )
-        self._writer.start(profile="", library="facet")
-        self._writer.add_metadata("facet", signed(metadata))
+        self._writer.start(profile="", library=WRITER)
+        self._writer.add_metadata(OWN_METADATA, signed(metadata))
 
     @property
     def path(self) -> Path:

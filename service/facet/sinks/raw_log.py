@@ -8,7 +8,7 @@ from mcap.writer import CompressionType, Writer
 
 from facet.sinks.durable_file import DurableFile
 from facet.sinks.log_file import CHUNK_BYTES, SYNC_BYTES
-from facet_protocol.metadata import signed
+from facet_protocol.metadata import OWN_METADATA, RECOVERER, signed
 
 
 class Raw(Protocol):
@@ -41,7 +41,7 @@ class RawLog:
             chunk_size=CHUNK_BYTES,
             compression=CompressionType.LZ4,
         )
-        self._writer.start(profile="", library="facet")
+        self._writer.start(profile="", library=RECOVERER)
 
     def add(self, message: Raw) -> None:
         """Take one message. Raises OSError."""
@@ -59,7 +59,7 @@ class RawLog:
 
     def add_metadata(self, name: str, entries: dict[str, str]) -> None:
         """Take a record of metadata; one of ours is signed again."""
-        self._writer.add_metadata(name, signed(entries) if name == "facet" else entries)
+        self._writer.add_metadata(name, signed(entries) if name == OWN_METADATA else entries)
 
     def finish(self) -> None:
         """Write the summary and close the file. Raises OSError."""

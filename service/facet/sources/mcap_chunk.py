@@ -57,9 +57,10 @@ def parse_chunk(content: bytes | memoryview) -> Chunk:
     return Chunk(size, crc, compression, at + 8, num_bytes)
 
 
-def inflate(chunk: Chunk, content: bytes | memoryview) -> bytes:
+def inflate(chunk: Chunk, content: bytes | memoryview, *, must_have_crc: bool = False) -> bytes:
     """The records of a chunk, checked. Raises ValueError on a wrong size or CRC, and for bombs:
-    never more than the chunk says it holds (plus a byte) is inflated, nor more than the limit."""
+    never more than the chunk says it holds (plus a byte) is inflated, nor more than the limit.
+    A CRC of 0 is none, unless its writer gives every chunk one."""
     if chunk.size > MAX_CHUNK_BYTES:
         raise ValueError(f"a chunk of {chunk.size} bytes, the limit is {MAX_CHUNK_BYTES}")
     if chunk.end > len(content):
@@ -71,7 +72,7 @@ def inflate(chunk: Chunk, content: bytes | memoryview) -> bytes:
         raise ValueError(f"{chunk.compression}: {error}") from error
     if len(data) != chunk.size:
         raise ValueError(f"{len(data)} bytes where {chunk.size} were declared")
-    if chunk.crc and zlib.crc32(data) != chunk.crc:
+    if (chunk.crc or must_have_crc) and zlib.crc32(data) != chunk.crc:
         raise ValueError("wrong checksum")
     return data
 

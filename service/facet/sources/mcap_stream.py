@@ -10,14 +10,14 @@ from __future__ import annotations
 import struct
 import zlib
 from collections.abc import Generator, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
 
 from mcap.data_stream import ReadDataStream
 from mcap.opcode import Opcode
-from mcap.records import Channel, DataEnd, Metadata, Schema, Statistics
+from mcap.records import Channel, DataEnd, Metadata, MetadataIndex, Schema, Statistics
 
 from facet.sources.mcap_chunk import (
     HEAD,
@@ -29,26 +29,17 @@ from facet.sources.mcap_chunk import (
     parse_chunk,
     records_of,
 )
+from facet.sources.mcap_damage import Damage, LogError
 from facet.sources.mcap_definitions import Definitions
-from facet_protocol.metadata import METADATA_CRC, metadata_crc
+from facet.sources.mcap_ends import MAGIC, find_summary, writer_of
+from facet_protocol.metadata import METADATA_CRC, OWN_METADATA, RECOVERER, WRITER, metadata_crc
 
-MAGIC = b"\x89MCAP0\r\n"
-MAX_NOTES = 100
 _MESSAGE = struct.Struct("<HIQQ")  # channel, sequence, log time, publish time
 _INDEX = struct.Struct("<HI")  # of messages: channel, length of the entries
-_FOOTER = struct.Struct("<BQQQI")  # opcode, length, summary start, offsets start, summary CRC
 _INDEX_ENTRY_BYTES = 16
 _KNOWN = frozenset(int(opcode) for opcode in Opcode)
 
 Reading = Generator["LogMessage", None, int]  # returns the offset at which to go on
-
-
-class LogError(ValueError):
-    """A log that cannot be read: which file, at which byte, and why."""
-
-    def __init__(self, path: Path, offset: int, reason: str) -> None:
-        super().__init__(f"{path}: byte {offset}: {reason}")
-        self.path, self.offset, self.reason = path, offset, reason
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -68,34 +59,6 @@ class LogMessage:
         return self.schema_record.name if self.schema_record else ""
 
 
-@dataclass(slots=True)
-class Damage:
-    """What a file has lost: empty when it is whole."""
-
-    notes: list[str] = field(default_factory=list)
-    lost_messages: int = 0  # as far as the file itself still says
-    lost_bytes: int = 0
-    is_doubtful: bool = False  # what was read may be wrong, and it cannot be told where
-
-    @property
-    def is_lossy(self) -> bool:
-        """More than the file's end or its index is missing."""
-        return bool(self.lost_messages or self.lost_bytes or self.is_doubtful)
-
-    def add(self, offset: int, num_bytes: int, reason: str) -> None:
-        self.lost_bytes += num_bytes
-        if len(self.notes) < MAX_NOTES:
-            self.notes.append(f"byte {offset}: {reason}")
-        elif len(self.notes) == MAX_NOTES:
-            self.notes.append(f"byte {offset}: and more")
-
-    def __bool__(self) -> bool:
-        return bool(self.notes)
-
-    def __str__(self) -> str:
-        return f"lost {self.lost_messages:,} messages that are known of, {self.lost_bytes:,} bytes"
-
-
 class McapStream:
     """Reads one file once, front to back, whole or damaged; `damage` is complete afterwards."""
 
@@ -112,6 +75,10 @@ class McapStream:
         self._start = start
         self._definitions = known or Definitions()
         self._statistics: Statistics | None = None
+        self._writer = ""  # as the header says
+        self._has_checksums = False  # a chunk has one, or it is a log of Facet's
+        self._has_own_metadata = False
+        self._num_metadata = 0  # records of it
         self._size = 0
         self._has_lost_chunk = False  # the one just before
         self._search_from = start  # behind the last record whose length is known to be right
@@ -126,6 +93,7 @@ class McapStream:
         """Every message of every whole chunk. Raises LogError when it is no MCAP file at all."""
         self._size = self.path.stat().st_size
         with self.path.open("rb", buffering=1 << 18) as file:
+            self._writer = writer_of(file)
             self._read_summary(file)
             at = yield from self._begin(file)
             while at < self._size and not self.is_finished:
@@ -134,6 +102,7 @@ class McapStream:
         if not self.is_finished and not self.damage:
             self.damage.add(self._size, 0, "the file was not finished: it is cut off here")
         self._check_counts()
+        self._check_completeness()
 
     def _begin(self, file: BinaryIO) -> Reading:
         file.seek(0)
@@ -205,7 +174,7 @@ class McapStream:
         end = at + HEAD_BYTES + len(content)
         try:
             chunk = parse_chunk(content)
-            data = inflate(chunk, content)
+            data = inflate(chunk, content, must_have_crc=self._is_own)
             self._checkrecords_of(data)
         except Exception as error:  # noqa: BLE001 as above
             reason = f"a chunk is damaged ({error})"
@@ -216,7 +185,7 @@ class McapStream:
             return (yield from self._salvage(file, at, reason))
         if opcode != Opcode.CHUNK:
             self.damage.add(at, 0, f"a chunk was marked as {_name(opcode)}")
-        yield from self._messages(data, is_checked=bool(chunk.crc))
+        yield from self._messages(data, is_checked=bool(chunk.crc) or self._is_own)
         self._search_from = at + HEAD_BYTES + chunk.end
         return end if self._is_followed(file, end, opcode) else self._search_from
 
@@ -254,6 +223,7 @@ class McapStream:
 
     def _messages(self, data: bytes, is_checked: bool) -> Iterator[LogMessage]:
         self.num_chunks += 1
+        self._has_checksums |= is_checked
         self._has_lost_chunk = False
         self._crc = None
         view = memoryview(data)
@@ -265,7 +235,7 @@ class McapStream:
 
     def _message(self, content: bytes) -> LogMessage:
         """A message outside of chunks."""
-        if self.num_chunks:
+        if self.num_chunks or self._is_own:
             raise ValueError("it lies outside of the chunks: no checksum vouches for it")
         message = self._parse(memoryview(content))
         self.num_messages += 1
@@ -298,9 +268,13 @@ class McapStream:
 
     def _note_metadata(self, metadata: Metadata, num_bytes: int) -> None:
         self._definitions.make_room(num_bytes)
-        crc = metadata.metadata.pop(METADATA_CRC, None)
-        if crc is not None and crc != metadata_crc(metadata.metadata):
-            raise ValueError("wrong checksum")
+        is_signed = metadata.metadata.get(METADATA_CRC) == metadata_crc(metadata.metadata)
+        if is_signed != (metadata.name == OWN_METADATA):
+            raise ValueError("wrong checksum" if not is_signed else "wrong name")
+        if is_signed:
+            del metadata.metadata[METADATA_CRC]
+            self._has_own_metadata = self._has_checksums = True
+        self._num_metadata += 1
         self.metadata.append(metadata)
 
     def _note_index(self, content: bytes) -> None:
@@ -315,8 +289,7 @@ class McapStream:
         if crc and self._crc is not None and not self._start and not self.damage:
             if crc != self._crc:
                 text = "the checksum of all messages is wrong: one is not as it was written"
-                self.damage.add(0, 0, text)
-                self.damage.is_doubtful = True
+                self.damage.doubt(0, text)
             else:
                 self.num_unchecked = 0
 
@@ -331,26 +304,16 @@ class McapStream:
     def _read_summary(self, file: BinaryIO) -> None:
         """What a finished file says at its end, if its CRC vouches for that: definitions that a
         lost chunk would take with it, and counts."""
-        at = self._size - len(MAGIC) - _FOOTER.size
-        file.seek(max(0, at))
-        footer = file.read(_FOOTER.size)
-        if len(footer) < _FOOTER.size or file.read() != MAGIC:
+        summary = find_summary(file, self._size)
+        if summary is None:
             return
-        opcode, length, start, _, crc = _FOOTER.unpack(footer)
-        if (opcode, length) != (Opcode.FOOTER, _FOOTER.size - HEAD_BYTES) or not crc:
-            return
-        start = start or at  # no summary: the CRC is that of the footer alone
-        if not 0 <= at - start <= MAX_RECORD_BYTES:
-            return
-        file.seek(start)
-        summary = file.read(at - start)
-        if zlib.crc32(footer[:-4], zlib.crc32(summary)) != crc:
-            self.damage.add(start, 0, "the summary is damaged (wrong checksum)")
+        if not summary.is_whole:
+            self.damage.add(summary.start, 0, "the summary is damaged (wrong checksum)")
             return
         try:
-            self._note_summary(summary)
+            self._note_summary(summary.records)
         except Exception as error:  # noqa: BLE001 as above
-            self.damage.add(start, 0, f"the summary is damaged ({error})")
+            self.damage.add(summary.start, 0, f"the summary is damaged ({error})")
 
     def _note_summary(self, summary: bytes) -> None:
         for opcode, start, end in records_of(summary):
@@ -358,6 +321,22 @@ class McapStream:
                 self._definitions.read(opcode, summary[start:end])
             elif opcode == Opcode.STATISTICS:
                 self._statistics = Statistics.read(ReadDataStream(BytesIO(summary[start:end])))
+            elif opcode == Opcode.METADATA_INDEX:
+                index = MetadataIndex.read(ReadDataStream(BytesIO(summary[start:end])))
+                self._has_checksums |= index.name == OWN_METADATA
+
+    @property
+    def _is_own(self) -> bool:
+        return self._writer in (WRITER, RECOVERER)
+
+    def _check_completeness(self) -> None:
+        """What a writer always gives, and what is missing here, was lost."""
+        if self.num_unchecked and self._has_checksums:
+            text = f"{self.num_unchecked} messages have lost their checksum: they may be wrong"
+            self.damage.doubt(0, text)
+        is_read = self.num_messages and not self._start
+        if is_read and self._writer == WRITER and not self._has_own_metadata:
+            self.damage.doubt(0, "its settings are lost")
 
     def _check_counts(self) -> None:
         """Holds what was read against what the file says it holds."""
@@ -370,11 +349,13 @@ class McapStream:
             self.damage.add(self._size, 0, f"{missing} messages that were written are missing")
         elif missing < 0:
             text = f"{-missing} messages more than were written: which ones cannot be told"
-            self.damage.add(self._size, 0, text)
-            self.damage.is_doubtful = True
+            self.damage.doubt(self._size, text)
         if statistics.chunk_count != self.num_chunks:
             text = f"{self.num_chunks} chunks of {statistics.chunk_count} that were written"
             self.damage.add(self._size, 0, text)
+        if statistics.metadata_count != self._num_metadata:
+            what = f"of {statistics.metadata_count} that were written"
+            self.damage.doubt(self._size, f"{self._num_metadata} records of metadata {what}")
 
 
 def _begins_record(opcode: int, length: int) -> bool:

@@ -6,7 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 from facet.sources.dialects import Dialects
-from facet.sources.mcap_stream import Damage, LogError, LogMessage, McapStream
+from facet.sources.mcap_damage import Damage, LogError
+from facet.sources.mcap_stream import LogMessage, McapStream
 from facet.sources.naming import is_input
 from facet_protocol import topics
 from facet_protocol.messages import Envelope
@@ -27,6 +28,7 @@ class Recording:
         self.paths = [file for path in paths for file in _files(path)]
         self.damage: dict[Path, Damage] = {}
         self.metadata: dict[str, dict[str, str]] = {}  # of the file being read, by name
+        self.num_unchecked = 0  # messages, of the files read so far, that no checksum vouches for
         self.num_bytes = sum(path.stat().st_size for path in self.paths)
 
     def __iter__(self) -> Iterator[Envelope]:
@@ -40,6 +42,7 @@ class Recording:
                 self._on_message(stream, envelope)
                 yield envelope
             self.metadata.update((m.name, m.metadata) for m in stream.metadata)
+            self.num_unchecked += stream.num_unchecked
 
     def head(self) -> dict[str, str]:
         """What the first file says of itself before its first message: settings, map, frame."""
