@@ -204,7 +204,7 @@ def test_beyond_the_horizon_the_first_stays_and_it_is_counted(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     """Whatever comes so late; other sources have a horizon of their own."""
-    monkeypatch.setattr(rivals, "HORIZON", rivals.FIRST_ROWS)
+    monkeypatch.setattr(rivals, "HORIZON", 64)
     best, worst = rival_pair(1)
     line = CorrectedLine(tmp_path)
     thin = [replace(small(k), points=small(k).points[:9]) for k in range(2, 66)]
@@ -263,7 +263,7 @@ def claim(sequence: int, text: str) -> Claim:
 
 
 def test_recent_is_a_ring(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rivals, "HORIZON", 2 * rivals.FIRST_ROWS)
+    monkeypatch.setattr(rivals, "HORIZON", 128)
     recent = Recent()
     for k in range(1, 1000):
         recent.add(k % 3, k, bytes([k % 256]) * 32)

@@ -23,7 +23,6 @@ HORIZON = 8192  # scans of a source whose hashes are known: 200 s at 40 Hz, 49 b
 MAX_SOURCES = 256  # whose scans are remembered: the one unheard for longest is forgotten
 WINDOW_BYTES = 16 << 20  # of the newest scans of all, as they came; an older one is in the log
 MAX_CHOSEN = 1 << 16  # numbers of which a later scan is in the map
-FIRST_ROWS = 64
 HASH_BYTES = 32
 
 
@@ -45,58 +44,56 @@ class Verdict(StrEnum):
 
 
 class Recent:
-    """Numbers and hashes of a source's last scans, up to HORIZON; the oldest is overwritten."""
+    """Numbers and hashes of a source's last HORIZON scans; the oldest is overwritten. It takes all
+    its memory at once: a robot that drives for hours needs no more than when it came."""
 
     def __init__(self) -> None:
-        self.numbers = np.zeros((FIRST_ROWS, 2), np.uint64)  # epoch, sequence
-        self.digests = np.zeros((FIRST_ROWS, HASH_BYTES), np.uint8)
-        self.is_placed = np.zeros(FIRST_ROWS, np.bool_)  # in the map; else it waits, or was refused
+        self.numbers = _taken((HORIZON, 2), np.uint64)  # epoch, sequence
+        self.digests = _taken((HORIZON, HASH_BYTES), np.uint8)
+        self.is_placed = _taken((HORIZON,), np.bool_)  # in the map; else it waits, or was refused
         self.num = 0  # that ever came
         self._last: tuple[int, int] | None = None
 
     def add(self, epoch: int, sequence: int, digest: bytes) -> None:
-        if self.num == len(self.numbers) < HORIZON:
-            self.grow()
-        row = self.num % len(self.numbers)
+        row = self.num % HORIZON
         self.numbers[row] = epoch, sequence
         self.digests[row] = np.frombuffer(digest, np.uint8)
         self.is_placed[row] = False
         self.num += 1
         self._last = epoch, sequence
 
-    def grow(self) -> None:
-        """Room for twice as many."""
-        self.numbers = np.concatenate([self.numbers, np.zeros_like(self.numbers)])
-        self.digests = np.concatenate([self.digests, np.zeros_like(self.digests)])
-        self.is_placed = np.concatenate([self.is_placed, np.zeros_like(self.is_placed)])
-
     def find(self, epoch: int, sequence: int) -> int | None:
         """Its row; None: it is not known any more."""
-        num = min(self.num, len(self.numbers))
         if self._last == (epoch, sequence):
-            return (self.num - 1) % len(self.numbers)
-        same = self.numbers[:num] == np.array((epoch, sequence), np.uint64)
+            return (self.num - 1) % HORIZON
+        known = self.numbers[: self.num]
+        same = known == np.array((epoch, sequence), np.uint64)
         rows = np.flatnonzero(same[:, 1] & same[:, 0])
         return int(rows[0]) if len(rows) else None
 
     def columns(self) -> tuple[NDArray[np.uint64], NDArray[np.uint8], NDArray[np.bool_]]:
         """(N, 2) numbers, (N, 32) hashes, (N,) whether placed; oldest first."""
-        order = np.arange(max(0, self.num - len(self.numbers)), self.num) % len(self.numbers)
+        order = np.arange(max(0, self.num - HORIZON), self.num) % HORIZON
         return self.numbers[order], self.digests[order], self.is_placed[order]
 
     @staticmethod
     def of(
         numbers: NDArray[np.uint64], digests: NDArray[np.uint8], is_placed: NDArray[np.bool_]
     ) -> Recent:
-        """What `columns` gave."""
+        """What `columns` gave. Raises ValueError for more."""
         recent = Recent()
         recent.num = len(numbers)
-        while len(recent.numbers) < recent.num:
-            recent.grow()
         recent.numbers[: recent.num] = numbers
         recent.digests[: recent.num] = digests
         recent.is_placed[: recent.num] = is_placed
         return recent
+
+
+def _taken(shape: tuple[int, ...], dtype: type[np.generic]) -> NDArray[Any]:
+    """Zeros whose memory is there, not only promised."""
+    out = np.empty(shape, dtype)
+    out.fill(0)
+    return out
 
 
 class Rivals:
@@ -212,9 +209,10 @@ class Rivals:
             "chosen": [[*number, digest.hex()] for number, digest in self._chosen.items()],
             "refused": [[*name, n.starts, n.ends] for name, n in self._refused.items()],
         }
-        none = Recent().columns()
+        none = (np.zeros((0, 2), np.uint64), np.zeros((0, HASH_BYTES), np.uint8))
         numbers, digests, is_placed = (
-            np.concatenate(column) for column in zip(none, *columns, strict=True)
+            np.concatenate(column)
+            for column in zip((*none, np.zeros(0, np.bool_)), *columns, strict=True)
         )
         return {
             "rivals": np.frombuffer(json.dumps(text).encode(), np.uint8),
