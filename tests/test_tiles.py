@@ -7,7 +7,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from facet.mapping.blocks import pack, pack_all, unpack
-from facet.mapping.tiles import ends_of, spread, tile_keys_of
+from facet.mapping.runs import starts_of
+from facet.mapping.tiles import edges_of, spread, tile_keys_of
 from mapping_logs import cloud, log, mapped, wall
 
 index = st.integers(-9000, 9000)
@@ -73,11 +74,13 @@ def test_changed_tiles_are_those_whose_voxels_show_otherwise() -> None:
 def test_adjacent_tile_planes_are_listed_once() -> None:
     whole = log("room-lidar3d")
     tiles = mapped(whole.scans, whole.settings)._tiles.tiles
-    for key, tile in tiles.items():
-        keys = np.full(len(tile.pairs), tile.key)
-        for own, other, theirs in ends_of(tile.pairs, keys).tolist():
-            assert (other, theirs) > (key, own)
-            assert own < tile.num_planes
-            assert theirs < tiles[other].num_planes
-            gap = np.abs(np.subtract(unpack(other), unpack(key)))
-            assert gap.max() <= 1
+    held = sorted((t for t in tiles.values() if t.num_planes), key=lambda t: t.key)
+    starts = starts_of([tile.num_planes for tile in held])
+    tile_of = np.repeat(np.arange(len(held)), np.diff(starts))
+    edges = edges_of(held, starts)
+    assert len(edges) > len(tile_of)
+    assert len(np.unique(edges, axis=0)) == len(edges)
+    assert np.all(edges[:, 0] < edges[:, 1])
+    for one, other in tile_of[edges].tolist():
+        gap = np.abs(np.subtract(unpack(held[other].key), unpack(held[one].key)))
+        assert gap.max() <= 1

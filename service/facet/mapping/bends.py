@@ -11,23 +11,24 @@ two faces of a free-standing wall.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from facet.mapping.blocks import unpack_all
 from facet.mapping.eigen import eigenvector, smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.merging import Nodes
 from facet.mapping.normals import UNIT, NormalField
 from facet.mapping.patches import PatchField
 from facet.mapping.planes import Table
-from facet.mapping.settings import STEPS, MapSettings
+from facet.mapping.settings import STEPS, TILE, MapSettings
 from facet.mapping.store import VoxelStore, centroid
 from facet.mapping.tiles import TileField
 
 SUMS = 22  # n; sum x (3), xx (6); sum u (3), u x (9): x in 1/8 voxels, u normals times UNIT
+UNKNOWN = -1
 ARC = 9  # n; sum s, ss, sss, ssss, h, hh, hs, hss: 1/8 voxels across, 1/64 voxels off the plane
 ARC_WIDTH = 10.0  # voxels: a narrower strip
 ARC_VOTES = 200  # of so many members at least is bent where its normals turn so that it
@@ -48,7 +49,8 @@ def _is_pure(normals, patches, row):  # type: ignore[no-untyped-def]
 
 @kernel
 def _add_members(store, normals, patches, rows, plane_of, origin, sums):  # type: ignore[no-untyped-def]
-    """Add pure members, rows (M,) of the planes plane_of (M,), to the sums (K, SUMS) of these."""
+    """Add pure members, rows (M,) of the tile-planes plane_of (M,), to the sums (K, SUMS) of
+    these, about `origin` (K, 3), 1/8 voxels."""
     blocks, columns = store
     x = np.empty(3, np.int64)
     for m in range(rows.shape[0]):
@@ -68,6 +70,29 @@ def _add_members(store, normals, patches, rows, plane_of, origin, sums):  # type
                 s += 1
             for b in range(3):
                 sums[k, 13 + 3 * a + b] += normals.unit[row, a] * x[b]
+
+
+@kernel
+def _pool(sums, corner, nodes, label, origin, out):  # type: ignore[no-untyped-def]
+    """Add the sums (T, SUMS) of the tile-planes `nodes`, about their `corner` (T, 3), to those of
+    their planes, out (K, SUMS), about `origin` (K, 3)."""
+    d = np.empty(3, np.int64)
+    for at in range(nodes.shape[0]):
+        t = nodes[at]
+        k, own = label[t], sums[t]
+        n = own[0]
+        out[k, 0] += n
+        for a in range(3):
+            d[a] = corner[t, a] - origin[k, a]
+        s = 4
+        for a in range(3):
+            out[k, 1 + a] += own[1 + a] + n * d[a]
+            out[k, 10 + a] += own[10 + a]
+            for b in range(a, 3):
+                out[k, s] += own[s] + d[a] * own[1 + b] + d[b] * own[1 + a] + n * d[a] * d[b]
+                s += 1
+            for b in range(3):
+                out[k, 13 + 3 * a + b] += own[13 + 3 * a + b] + own[10 + a] * d[b]
 
 
 @kernel
@@ -94,6 +119,14 @@ def _add_heights(store, normals, patches, rows, plane_of, origin, axes, pure, su
         sums[k, 6] += h * h
         sums[k, 7] += h * s
         sums[k, 8] += h * ss
+
+
+class Kept(NamedTuple):
+    """Sums of tile-planes as they were in a table."""
+
+    tile_keys: NDArray[np.int64]  # (L,)
+    starts: NDArray[np.int64]  # (L + 1,)
+    sums: NDArray[np.int64]  # (T, SUMS), UNKNOWN where nobody asked
 
 
 class Turn(NamedTuple):
@@ -195,6 +228,14 @@ class Bends:
     ) -> None:
         self._settings = settings
         self._store, self._normals, self._patches, self._tiles = store, normals, patches, tiles
+        self._kept = Kept(
+            np.zeros(0, np.int64), np.zeros(1, np.int64), np.zeros((0, SUMS), np.int64)
+        )
+        self._stirred: set[int] = set()
+
+    def forget(self, tiles: set[int]) -> None:
+        """Members of these tiles, by their keys, or their normals, are not what they were."""
+        self._stirred |= tiles
 
     def flat(
         self,
@@ -210,8 +251,7 @@ class Bends:
         flat = widths >= self._settings.min_width
         strips = flat & (widths < self._settings.strip_width)
         origin = np.floor(nodes.mean * STEPS).astype(np.int64)
-        sums = np.zeros((len(strips), SUMS), np.int64)
-        self._sum(_add_members, table, label, strips, origin, sums)
+        sums = self._sums(table, label, strips, origin)
         limit = np.radians(self._settings.bend_deg)
         arcs: dict[int, Turn] = {}
         turns = _turns(sums)
@@ -230,7 +270,11 @@ class Bends:
         for plane in np.flatnonzero(pure | thin).tolist():
             axes[plane] = arcs[plane].axes if pure[plane] else _axes(nodes.scatter[plane])
         heights = np.zeros((len(origin), ARC), np.int64)
-        self._sum(_add_heights, table, label, pure | thin, origin, axes, pure, heights)
+        asked = _nodes_of(label, pure | thin)
+        rows, sizes = self._members(table, asked)
+        _add_heights(
+            *self._voxels, rows, np.repeat(label[asked], sizes), origin, axes, pure, heights
+        )
         for plane, across in arcs.items():
             angle, deviation = _arc(heights[plane], across.width)
             least = max(np.radians(ARC_DEG), ARC_SIGMAS * deviation)
@@ -239,26 +283,57 @@ class Bends:
             flat[plane] = _bimodality(heights[plane]) < EMPTY
         return np.asarray(flat)
 
-    def _sum(
+    def _sums(
         self,
-        add: Callable[..., None],
         table: Table,
         label: NDArray[np.int64],
         asked: NDArray[np.bool_],
-        *arguments: NDArray[Any],
-    ) -> None:
-        """Hand the members of the planes that are `asked` for (K,) to `add`, all at once."""
-        held = np.flatnonzero(label >= 0)
-        nodes = held[asked[label[held]]]
-        at = table.tile_of[nodes]
-        own = [
-            self._tiles.tiles[key].members_of(number)
-            for key, number in zip(
-                table.tile_keys[at].tolist(), (nodes - table.starts[at]).tolist(), strict=True
-            )
-        ]
-        rows = np.concatenate([np.zeros(0, np.int32), *own])
-        plane_of = np.repeat(label[nodes], [len(members) for members in own])
+        origin: NDArray[np.int64],
+    ) -> NDArray[np.int64]:
+        """(K, SUMS) of the pure members of the planes that are `asked` for (K,). What is known of
+        tile-planes since an earlier update is not summed again."""
+        corner = STEPS * TILE * unpack_all(table.tile_keys)[table.tile_of]
+        kept = self._carry_over(table)
+        nodes = _nodes_of(label, asked)
+        new = nodes[kept.sums[nodes, 0] == UNKNOWN]
+        rows, sizes = self._members(table, new)
+        own = np.zeros((len(new), SUMS), np.int64)
+        _add_members(*self._voxels, rows, np.repeat(np.arange(len(new)), sizes), corner[new], own)
+        kept.sums[new] = own
+        out = np.zeros((len(asked), SUMS), np.int64)
+        _pool(kept.sums, corner, nodes, label, origin, out)
+        return out
+
+    def _carry_over(self, table: Table) -> Kept:
+        """What is kept, in the order of a new table."""
+        old, keys = self._kept, table.tile_keys
+        kept = Kept(keys, table.starts, np.full((len(table.total), SUMS), UNKNOWN, np.int64))
+        stirred = np.isin(keys, np.fromiter(self._stirred, np.int64, len(self._stirred)))
+        same = np.isin(keys, old.tile_keys) & ~stirred
+        shift = old.starts[np.searchsorted(old.tile_keys, keys[same])] - table.starts[:-1][same]
+        to = np.flatnonzero(same[table.tile_of])
+        kept.sums[to] = old.sums[to + np.repeat(shift, np.diff(table.starts)[same])]
+        self._kept = kept
+        self._stirred.clear()
+        return kept
+
+    @property
+    def _voxels(self) -> tuple[Any, ...]:
+        """What is known of voxels, as the loops take it."""
         store = self._store.blocks, self._store.columns
-        normals, patches = self._normals.normals, self._patches.patches
-        add(store, normals, patches, rows, plane_of, *arguments)
+        return store, self._normals.normals, self._patches.patches
+
+    def _members(
+        self, table: Table, nodes: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int32], list[int]]:
+        """(M,) voxel rows of tile-planes, one after another, and how many each has."""
+        at = table.tile_of[nodes]
+        keys, numbers = table.tile_keys[at].tolist(), (nodes - table.starts[at]).tolist()
+        own = [self._tiles.tiles[k].members_of(n) for k, n in zip(keys, numbers, strict=True)]
+        return np.concatenate([np.zeros(0, np.int32), *own]), [len(rows) for rows in own]
+
+
+def _nodes_of(label: NDArray[np.int64], asked: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Tile-planes of the planes that are asked for (K,)."""
+    held = np.flatnonzero(label >= 0)
+    return held[asked[label[held]]]

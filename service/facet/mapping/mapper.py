@@ -155,7 +155,7 @@ class Mapper:
         )
         done("patches")
         limit = limits(self.settings, self._patches.sigma() / TICKS)
-        grown, changed = self._tiles.update(
+        grown, changed, stirred = self._tiles.update(
             self._store,
             self._normals.normals,
             self._patches,
@@ -166,6 +166,7 @@ class Mapper:
             moved,
             touched,
         )
+        self._bends.forget(stirred)
         done("tiles")
         self._table = tabulate(self._tiles.tiles)
         self._planes = group_planes(self._table, limit, self.settings, self._bends.flat)

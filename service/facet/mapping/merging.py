@@ -129,13 +129,19 @@ def _best_cos(normals, narrow, unit, a, b):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def edge_costs(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-def]
-    """(E,) cost of merging along each edge; inf where its two ends disagree by themselves."""
+def _facing(votes, scatter, unit):  # type: ignore[no-untyped-def]
+    """(T, 3) normals of nodes, and (T,) whether they are narrow."""
     normals, narrow = np.empty((votes.shape[0], 3)), np.empty(votes.shape[0], np.bool_)
     for t in range(votes.shape[0]):
         nx, ny, nz, _, across = plane_of(votes[t], scatter[t], unit[t])
         normals[t, 0], normals[t, 1], normals[t, 2] = nx, ny, nz
         narrow[t] = 12.0 * across < NARROW * NARROW
+    return normals, narrow
+
+
+@kernel
+def _edge_costs(votes, mean, unit, normals, narrow, edges, limit):  # type: ignore[no-untyped-def]
+    """(E,) cost of merging along each edge; inf where its two ends disagree by themselves."""
     costs = np.empty(edges.shape[0])
     for e in range(edges.shape[0]):
         a, b = edges[e, 0], edges[e, 1]
@@ -186,17 +192,12 @@ def _try(votes, mean, scatter, unit, normals, narrow, a, b, limit, m, s, u):  # 
 
 
 @kernel
-def merge(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-def]
-    """Merge nodes along edges (E, 2), given best first. The four statistics end as those of the
-    merged nodes, at the root's row. Returns (T,) the root of each node: its smallest member."""
+def _merge(votes, mean, scatter, unit, normals, narrow, edges, limit):  # type: ignore[no-untyped-def]
+    """Merge nodes along edges (E, 2), given best first. The statistics end as those of the merged
+    nodes, at the root's row. Returns (T,) the root of each node: its smallest member."""
     count = votes.shape[0]
     parent = np.arange(count)
     version = np.zeros(count, np.int64)
-    normals, narrow = np.empty((count, 3)), np.empty(count, np.bool_)
-    for t in range(count):
-        nx, ny, nz, _, across = plane_of(votes[t], scatter[t], unit[t])
-        normals[t, 0], normals[t, 1], normals[t, 2] = nx, ny, nz
-        narrow[t] = 12.0 * across < NARROW * NARROW
     m, s, u = np.zeros(3), np.zeros(6), np.zeros(3)
     tried = np.full((edges.shape[0], 2), -1, np.int64)
     merged = True
@@ -226,13 +227,14 @@ def merge(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-
 
 @kernel
 def merge_all(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-def]
-    """`merge` along all edges (E, 2), which must come in a canonical order, best first."""
-    costs = edge_costs(votes, mean, scatter, unit, edges, limit)
-    order = np.argsort(costs, kind="mergesort")
-    count = 0
-    while count < order.shape[0] and costs[order[count]] < np.inf:
-        count += 1
-    return merge(votes, mean, scatter, unit, edges[order[:count]], limit)
+    """Merge nodes along edges (E, 2), which must come in a canonical order, best first. The four
+    statistics end as those of the merged nodes, at the root's row. Returns (T,) the root of each
+    node: its smallest member."""
+    normals, narrow = _facing(votes, scatter, unit)
+    costs = _edge_costs(votes, mean, unit, normals, narrow, edges, limit)
+    worth = np.flatnonzero(costs < np.inf)
+    best_first = worth[np.argsort(costs[worth], kind="mergesort")]
+    return _merge(votes, mean, scatter, unit, normals, narrow, edges[best_first], limit)
 
 
 def merge_nodes(

@@ -19,9 +19,10 @@ from facet.mapping.kernel import kernel
 from facet.mapping.merging import Limits, Nodes, merge_nodes, plane_of, pool
 from facet.mapping.runs import starts_of
 from facet.mapping.settings import TICKS, TILE, MapSettings
-from facet.mapping.tiles import Tile, ends_of
+from facet.mapping.tiles import Tile, edges_of
 
 FREE = -1
+ADOPTIONS = 10  # rounds in which freed tile-planes are offered to the planes beside them
 ENOUGH_POINTS = 200  # pure points that a plane is fitted to
 
 
@@ -77,16 +78,12 @@ def tabulate(tiles: dict[int, Tile]) -> Table:
         pairs, points = empty.reshape(0, 2), np.zeros((0, 10), np.int64)
         return Table(keys, starts, none, empty, pairs, points, empty, empty)
     nodes = Nodes(*(np.concatenate(c) for c in zip(*(t.nodes for t in ordered), strict=True)))
-    of = np.repeat(np.arange(len(ordered)), [len(t.pairs) for t in ordered])
-    pairs = ends_of(np.concatenate([t.pairs for t in ordered]), keys[of])
-    own = starts[of] + pairs[:, 0]
-    other = starts[np.searchsorted(keys, pairs[:, 1])] + pairs[:, 2]
     return Table(
         keys,
         starts,
         nodes,
         np.concatenate([t.occupation for t in ordered]),
-        np.stack([own, other], axis=1),
+        edges_of(ordered, starts),
         np.concatenate([t.points for t in ordered]),
         np.concatenate([t.total for t in ordered]),
         np.repeat(np.arange(len(ordered)), counts),
@@ -113,7 +110,7 @@ def group_planes(
     stages.detailed = int(keep.sum())
     label, nodes = _drop(label, nodes, keep)
 
-    every = np.argwhere(np.triu(np.ones((len(nodes.votes),) * 2, np.bool_), 1)).astype(np.int64)
+    every = np.stack(np.triu_indices(len(nodes.votes), 1), axis=1)
     tight = limit._replace(edge_cos=float(np.cos(limit.bridge)), offset=limit.cross)
     roots, merged = merge_nodes(nodes, every, tight)
     into, nodes = _relabel(roots, merged)
@@ -161,14 +158,21 @@ def _occupation(label: NDArray[np.int64], table: Table, count: int) -> NDArray[n
     return np.bincount(label[on], table.occupation[on], minlength=count).astype(np.int64)
 
 
+@kernel
+def _fits_of(votes, scatter, unit):  # type: ignore[no-untyped-def]
+    """(K, 4) unit normals of nodes and their variance along them."""
+    out = np.empty((votes.shape[0], 4))
+    for k in range(votes.shape[0]):
+        nx, ny, nz, variance, _ = plane_of(votes[k], scatter[k], unit[k])
+        out[k, 0], out[k, 1], out[k, 2], out[k, 3] = nx, ny, nz, variance
+    return out
+
+
 def _average_sigma(nodes: Nodes) -> float:
     """Mean over planes of sigma_N, weighted by their voxels."""
     if not len(nodes.votes):
         return 0.0
-    sigmas = [
-        np.sqrt(plane_of(v, s, u)[3])
-        for v, s, u in zip(nodes.votes, nodes.scatter, nodes.unit, strict=True)
-    ]
+    sigmas = np.sqrt(_fits_of(nodes.votes, nodes.scatter, nodes.unit)[:, 3])
     return float(np.average(sigmas, weights=nodes.votes))
 
 
@@ -196,44 +200,45 @@ def _fits(votes, mean, scatter, unit, t, normal, centre, limit):  # type: ignore
 @kernel
 def _adopt_along(votes, mean, scatter, unit, edges, label, normals, centres, limit):  # type: ignore[no-untyped-def]
     """Offer free nodes to the planes of their neighbours, nearest first, until nothing changes."""
-    count = votes.shape[0]
-    loose = np.empty(edges.shape[0], np.int64)  # edges with a free end: the others offer nothing
+    loose = np.empty((edges.shape[0], 2), np.int64)  # edges with a free end: the others offer none
     num = 0
     for e in range(edges.shape[0]):
-        loose[num] = e
-        num += label[edges[e, 0]] == -1 or label[edges[e, 1]] == -1
-    for _ in range(10):
-        best = np.full(count, -1, np.int64)
-        best_rms = np.full(count, np.inf)
-        for at in range(num):
-            e = loose[at]
-            for way in range(2):
-                t, other = edges[e, way], edges[e, 1 - way]
-                p = label[other]
-                if label[t] != -1 or p == -1:
-                    continue
-                rms = _fits(votes, mean, scatter, unit, t, normals[p], centres[p], limit)
-                if rms >= 0.0 and (rms < best_rms[t] or (rms == best_rms[t] and p < best[t])):
-                    best[t], best_rms[t] = p, rms
-        changed = False
-        for t in range(count):
-            if best[t] >= 0:
-                label[t] = best[t]
-                changed = True
-        if not changed:
+        loose[num] = edges[e]
+        num += (label[edges[e, 0]] == FREE) | (label[edges[e, 1]] == FREE)
+    best = np.full(votes.shape[0], FREE, np.int64)
+    best_rms = np.full(votes.shape[0], np.inf)
+    taken = np.empty(votes.shape[0], np.int64)
+    for _ in range(ADOPTIONS):
+        left, num_taken = 0, 0
+        for e in range(num):
+            t, other = loose[e, 0], loose[e, 1]
+            if label[t] != FREE:
+                t, other = other, t
+            p = label[other]
+            if p == FREE:  # both are free: perhaps later
+                loose[left] = loose[e]
+                left += 1
+                continue
+            if label[t] != FREE:  # neither is any more
+                continue
+            rms = _fits(votes, mean, scatter, unit, t, normals[p], centres[p], limit)
+            if rms >= 0.0 and (rms < best_rms[t] or (rms == best_rms[t] and p < best[t])):
+                if best[t] == FREE:
+                    taken[num_taken] = t
+                    num_taken += 1
+                best[t], best_rms[t] = p, rms
+        for at in range(num_taken):
+            label[taken[at]] = best[taken[at]]
+        if num_taken == 0:
             break
+        num = left
 
 
 def _adopt(
     table: Table, label: NDArray[np.int64], nodes: Nodes, limit: Limits
 ) -> NDArray[np.int64]:
     label = label.copy()
-    normals = np.array(
-        [
-            plane_of(v, s, u)[:3]
-            for v, s, u in zip(nodes.votes, nodes.scatter, nodes.unit, strict=True)
-        ]
-    ).reshape(-1, 3)
+    normals = _fits_of(nodes.votes, nodes.scatter, nodes.unit)[:, :3]
     _adopt_along(*table.nodes, table.edges, label, normals, nodes.mean, limit)
     return label
 

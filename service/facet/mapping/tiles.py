@@ -121,11 +121,12 @@ class TileField:
         turned: NDArray[np.int32],
         moved: NDArray[np.int32],
         touched: Touched,
-    ) -> tuple[list[int], list[int]]:
+    ) -> tuple[list[int], list[int], set[int]]:
         """Bring the tiles up to date. The arguments after `limits` are blocks: patches changed,
         labels changed, normals or centroids changed, centroids changed; and voxels.
 
-        Returns tile keys: (tile-planes grown again, voxels of tile-planes changed)."""
+        Returns tile keys: (tile-planes grown again, voxels of tile-planes changed, these or their
+        normals changed)."""
         self._admit(store)
         keys = store.blocks.keys
         if limits != self._limits:
@@ -138,11 +139,12 @@ class TileField:
         changed = sorted(self._near(keys[others], np.array(regroup, np.int64)))
         self._fill(store, patches, changed)
         near = self._near(keys[np.unique(store.columns.block[touched.rows])])
-        anew = {*changed, *(near if touched.before is None else self._near(keys[turned]))}
+        stirred = {*changed, *self._near(keys[turned])}
+        anew = stirred | near if touched.before is None else stirred
         self._sum(store, normals, patches, sorted(anew))
         self._add(store, normals, patches, sorted(near - anew), touched)
         self._pair(store, patches, self._beside(regroup))
-        return regroup, changed
+        return regroup, changed, stirred
 
     def name(
         self, tile_keys: NDArray[np.int64], starts: NDArray[np.int64], ids: NDArray[np.int64]
@@ -331,11 +333,15 @@ class TileField:
             self.tiles[key].pairs = own[:count].copy()
 
 
-def ends_of(pairs: NDArray[np.int64], tile_keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(P, 3) own tile-plane, key of the other tile and its tile-plane, of the pairs (P,) of tiles
-    with these keys (P,)."""
-    other = tile_keys + _STEPS[(pairs >> 16) & 0xFFFF]
-    return np.stack([pairs >> 32, other, pairs & 0xFFFF], axis=1)
+def edges_of(tiles: list[Tile], starts: NDArray[np.int64]) -> NDArray[np.int64]:
+    """(E, 2) the adjacent tile-planes of all tiles, by ascending key, when those of tile n are
+    numbered from starts[n] on."""
+    keys = np.array([tile.key for tile in tiles], np.int64)
+    near = np.searchsorted(keys, keys[:, None] + _STEPS)  # (N, 27) places of the tiles round each
+    pairs = np.concatenate([tile.pairs for tile in tiles])
+    own = np.repeat(np.arange(len(tiles)), [len(tile.pairs) for tile in tiles])
+    other = near[own, (pairs >> 16) & 0xFFFF]
+    return np.stack([starts[own] + (pairs >> 32), starts[other] + (pairs & 0xFFFF)], axis=1)
 
 
 def _tile_keys(tiles: list[Tile]) -> NDArray[np.int64]:
