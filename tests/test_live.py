@@ -91,6 +91,27 @@ def test_a_message_that_is_too_large_is_cut_in_the_transport() -> None:
         source.close()
 
 
+def test_what_a_thread_of_zenohs_knows_stays_with_it() -> None:
+    """Its state is not made anew for each message, or what is local to it would be lost."""
+    own, num_new = threading.local(), 0
+
+    class Noting(Inbox):
+        def push(self, sample: Any, what: Any = None) -> None:
+            nonlocal num_new
+            num_new += not hasattr(own, "is_known")
+            own.is_known = True
+            super().push(sample, what)
+
+    with service_and_client() as (service, client):
+        inbox = Noting(1000, 1 << 24)
+        source = LiveSource(service, "map", inbox)
+        for _ in range(100):
+            client.put(KEY, b"x")
+        take_all(inbox, 100)
+        source.close()
+    assert num_new <= 10  # one for each thread
+
+
 def test_without_an_attachment_there_is_no_sequence() -> None:
     inbox = Inbox(10, 1 << 20, lambda: 42)
     inbox.push(sample(0))

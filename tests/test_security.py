@@ -10,11 +10,13 @@ index at hand serves neither hashes of its own nor known vulnerabilities to audi
 from __future__ import annotations
 
 import ast
+import resource
 import socket
 import subprocess
 import sys
 import threading
 import time
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 
@@ -23,8 +25,15 @@ import pytest
 import zenoh
 
 from certificates import USERS, Site
-from facet.config import load_config
-from facet.session import client_settings, open_session, service_settings
+from facet.config import NetworkSection, load_config
+from facet.session import (
+    MAX_PENDING,
+    MIN_PENDING,
+    OWN_FILES,
+    client_settings,
+    open_session,
+    service_settings,
+)
 from facet_protocol import topics
 from fault_rig import Line, around, small_scan
 from rig import free_endpoint, scan_envelope, wait_until
@@ -110,6 +119,36 @@ def test_s4_a_flood_of_connections_and_junk_starves_nobody(tmp_path: Path) -> No
         for one in idle:
             one.close()
         service.stop()
+
+
+def test_s4_half_open_connections_keep_no_one_out() -> None:
+    """Hundreds that connect and never say who they are: a robot that comes after them gets in at
+    once, and they are shut out in a while."""
+    endpoint = free_endpoint()
+    settings = service_settings(NetworkSection(listen=(endpoint,), shared_memory=False))
+    address = ("127.0.0.1", int(endpoint.rpartition(":")[2]))
+    robot = client_settings(endpoint, shared_memory=False) | {"connect/timeout_ms": 1000}
+    with open_session(settings), ExitStack() as stack:
+        idle = [stack.enter_context(socket.create_connection(address, 5)) for _ in range(400)]
+        for number, one in enumerate(idle):
+            one.sendall(bytes([number % 256]) * (number % 100))
+        assert opens(robot)
+        for one in idle:
+            with suppress(ConnectionResetError):  # what it said was not read to the end
+                while one.recv(1 << 10):  # a reason, perhaps
+                    pass
+
+
+def test_s4_logs_come_before_connections(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where a process may open few files, fewer connections may be half open."""
+    network, key = NetworkSection(max_sessions=100), "transport/unicast/accept_pending"
+    for hard, pending in (
+        (1 << 20, MAX_PENDING),
+        (1000, 1000 - 100 - OWN_FILES),
+        (50, MIN_PENDING),
+    ):
+        monkeypatch.setattr(resource, "getrlimit", lambda _, hard=hard: (hard, hard))
+        assert service_settings(network)[key] == pending
 
 
 def test_s7_nothing_is_said_outside_our_prefix(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, NamedTuple, TypeGuard
 
@@ -215,7 +216,7 @@ class Admission:
     def _decode(self, envelope: Envelope) -> Scan:
         """The scan, with what is to be known of its frame. Raises ProtocolError."""
         if envelope.key.startswith(f"{PREFIX}/"):
-            parse_scan_key(envelope.key)  # a name of ours that is none is refused, not mended
+            _check_scan_key(envelope.key)  # a name of ours that is none is refused, not mended
         robot, sensor = names_of(envelope)
         scan = decode_scan(envelope, robot, sensor, self._reach_m, pose_required=False)
         if envelope.rule is not None and envelope.rule.frame:
@@ -308,6 +309,12 @@ class Admission:
 
     def _refuse(self, source: str, error: ProtocolError) -> None:
         self._placement.refuse(source, error)
+
+
+@lru_cache(maxsize=1024)  # of those that are right
+def _check_scan_key(key: str) -> None:
+    """Raises ProtocolError."""
+    parse_scan_key(key)
 
 
 def _inner(envelope: Envelope) -> Envelope:

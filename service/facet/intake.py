@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Iterable
 from dataclasses import replace
 from functools import partial
@@ -245,7 +245,8 @@ class Intake:
             self._account.count("duplicate_publisher", source)
             text = f"epochs alternate ({envelope.epoch}): two publishers share the name"
             self._account.complain(source, "duplicate_publisher", text)
-        self._say_missing(source)
+        if noted.skipped or noted.is_late:
+            self._say_missing(source)
 
     def _say_missing(self, source: str) -> None:
         missing = self._ledger.missing(source)[source]
@@ -301,10 +302,14 @@ class Intake:
             if self.follower is not None:
                 self.follower.write(envelope, message)
         scans, self._scans = self._scans, []
+        recorded, newest = Counter[str](), dict[str, int]()
         for envelope in scans:
             source = source_of(envelope)
-            self._account.count("recorded", source)
-            self._account.gauge("ack", envelope.sequence, source)
+            recorded[source] += 1
+            newest[source] = envelope.sequence
+        for source, num in recorded.items():
+            self._account.count("recorded", source, num)
+            self._account.gauge("ack", newest[source], source)
         if scans:
             position = self._recorder.position
             self._note_past(scans, position)

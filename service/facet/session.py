@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
+import resource
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -15,12 +17,19 @@ from facet.config import ConfigError, NetworkSection, load_credentials
 DEFAULT_ENDPOINT = "tcp/127.0.0.1:7447"
 CONNECT_TIMEOUT_MS = 3000
 ENVELOPE_BYTES = 1 << 16  # what travels beside a payload: key, encoding, attachment
-MAX_PENDING = 64  # connections that have not shown who they are
+MAX_PENDING = 4096  # connections that have not shown who they are: 10 KB and an open file each
+MIN_PENDING = 64  # of them, where a process may not open many files
+ACCEPT_MS = 3000  # for showing it
+ACCEPTORS = 32  # threads of Zenoh's; they hear all links, and wait for each that they close
+OWN_FILES = 256  # of the log, the viewer, the libraries: no connection takes their place
 
 
 @contextmanager
 def open_session(settings: dict[str, Any]) -> Iterator[zenoh.Session]:
     """A session that is closed whatever happens: an open one keeps the process from ending."""
+    if settings.get("listen/endpoints"):
+        _allow_files(settings)
+        os.environ.setdefault("ZENOH_RUNTIME", f"(acc: (worker_threads: {ACCEPTORS}))")
     session = zenoh.open(_config(settings))
     try:
         yield session
@@ -37,7 +46,8 @@ def service_settings(network: NetworkSection) -> dict[str, Any]:
         "low_pass_filter": [_size_limit(network.max_message_bytes)],
         "transport/link/rx/max_message_size": network.max_message_bytes + ENVELOPE_BYTES,
         "transport/unicast/max_sessions": network.max_sessions,
-        "transport/unicast/accept_pending": min(MAX_PENDING, network.max_sessions),
+        "transport/unicast/accept_pending": _max_pending(network.max_sessions),
+        "transport/unicast/accept_timeout": ACCEPT_MS,
         "transport/shared_memory/enabled": network.shared_memory,
     }
     shown = _shown(network.credentials) if network.credentials is not None else {}
@@ -50,6 +60,27 @@ def service_settings(network: NetworkSection) -> dict[str, Any]:
     if network.access_control is not None:
         settings["access_control"] = read_access_control(network.access_control)
     return settings
+
+
+def _max_pending(max_sessions: int) -> int:
+    """How many connections may be half open: who opens so many, again and again, keeps others out.
+    As many as there may be files beside what is needed."""
+    files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    if files == resource.RLIM_INFINITY:
+        return MAX_PENDING
+    return min(MAX_PENDING, max(MIN_PENDING, files - max_sessions - OWN_FILES))
+
+
+def _allow_files(settings: dict[str, Any]) -> None:
+    """Raise what this process may open, as far as it may itself, to what the settings let in."""
+    unicast = "transport/unicast/"
+    wanted = settings.get(f"{unicast}accept_pending", 0) + settings.get(f"{unicast}max_sessions", 0)
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    if not wanted or soft in (hard, resource.RLIM_INFINITY) or soft >= wanted + OWN_FILES:
+        return
+    most = wanted + OWN_FILES if hard == resource.RLIM_INFINITY else min(hard, wanted + OWN_FILES)
+    with suppress(OSError, ValueError):  # a system with a limit of its own: fewer get in at once
+        resource.setrlimit(resource.RLIMIT_NOFILE, (most, hard))
 
 
 def read_access_control(path: Path) -> dict[str, Any]:

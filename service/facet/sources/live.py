@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import threading
 import time
 from collections import deque
@@ -38,17 +39,12 @@ class Waiting:
     num_bytes: int
     what: Recognised
 
-    def envelope(self, payload: bytes = b"") -> Envelope:
-        """Without what the attachment says."""
+    @property
+    def source(self) -> str:
         what = self.what
-        return Envelope(
-            what.topic,
-            what.schema,
-            what.encoding,
-            payload,
-            received_ns=self.received_ns,
-            rule=what.rule,
-        )
+        if what.rule is None:
+            return source_of(what.topic)
+        return source_of(Envelope(what.topic, what.schema, what.encoding, b"", rule=what.rule))
 
 
 class Tally(Protocol):
@@ -99,7 +95,7 @@ class Inbox:
         with self._changed:
             self.num_received += 1
             if self._tally is not None:
-                self._tally.arrive(source_of(waiting.envelope()))
+                self._tally.arrive(waiting.source)
             if waiting.num_bytes > self._max_message_bytes:
                 self._drop(waiting, "too_large")
                 return
@@ -248,10 +244,12 @@ class LiveSource:
             self._dialects.forget(token)
 
     def _take_native(self, sample: zenoh.Sample) -> None:
+        _keep_thread_state()
         self._inbox.push(sample, self._dialects.recognise(*_names(sample)))
 
     def _take_foreign(self, sample: zenoh.Sample) -> None:
         """What lies on any other key: static transforms come by a way of their own."""
+        _keep_thread_state()
         what = self._wanted(sample)
         if what is None:
             self._inbox.num_ignored += not str(sample.key_expr).startswith(f"{PREFIX}/")
@@ -275,6 +273,18 @@ class LiveSource:
         return what if is_read else None
 
 
+_kept = threading.local()
+
+
+def _keep_thread_state() -> None:
+    """Keep what the interpreter knows of this thread, one of Zenoh's. It would be made for each
+    message and thrown away after it, with memory that goes back to the system each time: as long
+    again as the message takes."""
+    if not hasattr(_kept, "is_kept"):
+        ctypes.pythonapi.PyGILState_Ensure()  # and no release: the thread lives as long as we do
+        _kept.is_kept = True
+
+
 def native(sample: zenoh.Sample) -> Recognised:
     """What a sample says itself, by its encoding."""
     key, encoding = _names(sample)
@@ -292,18 +302,25 @@ def _is_static(what: Recognised) -> bool:
 def envelope_of(waiting: Waiting, payload: bytes) -> Envelope:
     """The sample as an envelope; one without an attachment that we know has no sequence, and its
     receipt as stamp."""
-    sample = waiting.sample
-    mark = _attachment_of(waiting, sample.attachment.to_bytes() if sample.attachment else b"")
-    return replace(
-        waiting.envelope(payload),
+    what, beside = waiting.what, waiting.sample.attachment
+    mark = _attachment_of(waiting, beside.to_bytes() if beside else b"")
+    return Envelope(
+        what.topic,
+        what.schema,
+        what.encoding,
+        payload,
         stamp_ns=max(mark.stamp_ns, 0),
         epoch=mark.epoch,
         sequence=mark.sequence,
+        received_ns=waiting.received_ns,
+        rule=what.rule,
     )
 
 
 def _attachment_of(waiting: Waiting, data: bytes) -> attachment.Attachment:
     what = waiting.what
+    if not data:
+        return attachment.Attachment(epoch=0, sequence=0, stamp_ns=waiting.received_ns)
     try:
         if what.dialect is not Dialect.RMW_ZENOH:
             return attachment.unpack(data)
