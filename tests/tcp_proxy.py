@@ -5,11 +5,14 @@ from __future__ import annotations
 import contextlib
 import socket
 import threading
+from collections.abc import Callable
 from types import TracebackType
 
 
 class Proxy:
     """Forwards 127.0.0.1:`port` to `target`. `cut` drops every connection and takes no new one."""
+
+    num_bytes = 0  # that went to the target
 
     def __init__(self, target: str) -> None:
         host, _, port = target.removeprefix("tcp/").rpartition(":")
@@ -24,8 +27,9 @@ class Proxy:
     def endpoint(self) -> str:
         return f"tcp/127.0.0.1:{self._port}"
 
-    def restore(self) -> None:
-        """The network is back."""
+    def restore(self, max_bytes: int | None = None) -> None:
+        """The network is back; for good, or until so many bytes have gone to the target."""
+        self.num_bytes, self._max_bytes = 0, max_bytes
         door = socket.socket()
         door.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         door.bind(("127.0.0.1", self._port))
@@ -53,8 +57,13 @@ class Proxy:
             far.settimeout(None)
             with self._lock:
                 self._pairs += [near, far]
-            for one, other in ((near, far), (far, near)):
-                threading.Thread(target=_pump, args=(one, other), daemon=True).start()
+            for one, other, count in ((near, far, self._count), (far, near, len)):
+                threading.Thread(target=_pump, args=(one, other, count), daemon=True).start()
+
+    def _count(self, data: bytes) -> None:
+        self.num_bytes += len(data)
+        if self._max_bytes is not None and self.num_bytes > self._max_bytes:
+            self.cut()
 
     def __enter__(self) -> Proxy:
         return self
@@ -68,10 +77,11 @@ class Proxy:
         self.cut()
 
 
-def _pump(one: socket.socket, other: socket.socket) -> None:
+def _pump(one: socket.socket, other: socket.socket, count: Callable[[bytes], object]) -> None:
     with contextlib.suppress(OSError):
         while data := one.recv(1 << 16):
             other.sendall(data)
+            count(data)
     for end in (one, other):
         with contextlib.suppress(OSError):
             end.shutdown(socket.SHUT_RDWR)

@@ -20,8 +20,10 @@ from facet.session import client_settings, open_session, read_access_control, se
 from facet.sources.live import Inbox, LiveSource
 from facet_protocol.messages import Envelope
 from rig import free_endpoint, room, wait_until
+from tcp_proxy import Proxy
 
 KEY = "facet/v1/map/robot/{}/scan/lidar"
+HERE = "tcp/127.0.0.1"
 ENCODING = "application/protobuf;foxglove.PointCloud"
 
 
@@ -87,7 +89,7 @@ def credentials_of(site: Site, kind: str, name: str) -> Path:
 
 @pytest.mark.parametrize("kind", ["mtls", "users"])
 def test_a_robot_speaks_under_its_own_name_only(site: Site, kind: str) -> None:
-    """S5, and that what a stall made us miss is asked for through the same door."""
+    """S5."""
     with door(site, kind) as inbox, ExitStack() as stack:
         for robot, other in (("r1", "r2"), ("r2", "r1")):
             session = stack.enter_context(client(site.endpoint, credentials_of(site, kind, robot)))
@@ -103,6 +105,58 @@ def test_a_robot_speaks_under_its_own_name_only(site: Site, kind: str) -> None:
         )  # fmt: skip
         publisher.close()
     assert numbers == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("kind", ["mtls", "users"])
+def test_what_a_robot_sent_in_vain_is_asked_for_through_the_same_door(
+    site: Site, kind: str
+) -> None:
+    """What lies under @adv is let in by a rule of its own."""
+    scan, numbers = room(1)[0], list[int]()
+    with door(site, kind) as inbox, Proxy(site.endpoint.replace("tls/localhost", HERE)) as network:
+
+        def taken() -> list[int]:
+            numbers.extend(e.sequence for e in inbox.take(1 << 24))
+            return sorted(numbers)
+
+        endpoint = network.endpoint.replace(HERE, "tls/localhost")
+        with client(endpoint, credentials_of(site, kind, "r1")) as robot:
+            publisher = RobotPublisher(robot, "map")
+            publisher.publish("r1", "lidar", scan)
+            wait_until(lambda: taken() == [1])
+            network.cut()
+            wait_until(lambda: not list(robot.info.routers_zid()), 20)
+            for _ in range(10):
+                publisher.publish("r1", "lidar", scan)
+            network.restore()
+            wait_until(lambda: taken() == list(range(1, 12)), 20)
+            publisher.close()
+
+
+@pytest.mark.parametrize("kind", ["mtls", "users"])
+def test_a_robot_does_not_answer_for_another(site: Site, kind: str) -> None:
+    """S5: nobody else says what r1 has sent."""
+    kept = KEY.format("r1") + "/@adv/pub/1/2/_"
+    settings = service_settings(load_config(site.settings(kind)).network)
+    with open_session(settings) as service, ExitStack() as stack:
+        sessions = [
+            stack.enter_context(client(site.endpoint, credentials_of(site, kind, robot)))
+            for robot in ("r2", "r1")
+        ]
+        answers = [
+            session.declare_queryable(kept, lambda q, word=word: q.reply(q.key_expr, word))
+            for session, word in zip(sessions, (b"r2", b"r1"), strict=True)
+        ]
+        said: list[bytes] = []
+        wait_until(lambda: said.extend(words(service, kept)) or said)
+        assert set(said) == {b"r1"}
+        for answer in answers:
+            answer.undeclare()
+
+
+def words(session: zenoh.Session, key: str) -> list[bytes]:
+    replies = session.get(key, target=zenoh.QueryTarget.ALL, timeout=2.0)
+    return [reply.ok.payload.to_bytes() for reply in replies if reply.ok]
 
 
 def test_no_password_or_a_wrong_one_is_no_session(site: Site) -> None:

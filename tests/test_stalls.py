@@ -7,7 +7,7 @@ import signal
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from test_commands import Running
 SCAN = room(1)[0]  # 54 kB: eight seconds of them fit into no socket
 SMALL = envelopes("r1", 1)[0]  # a minute of them fits into our publisher's cache
 RATE_HZ = 40
+SETTLED_S = 60.0  # until all is received or lost, on a machine that is busy with other things
 
 
 class Sender:
@@ -64,7 +65,7 @@ class Sender:
                 self.worst_put_s = max(self.worst_put_s, time.monotonic() - started)
                 due = max(due + 1.0 / RATE_HZ, time.monotonic())
                 self._stop.wait(due - time.monotonic())
-            self._done.wait(60)
+            self._done.wait(2 * SETTLED_S)
 
     def _ours(self, session: zenoh.Session) -> Any:
         publisher = RobotPublisher(session, "map")
@@ -114,7 +115,7 @@ def counted(seen: list[Status], robot: str) -> tuple[int, int]:
 def wait_until_heard_again(plain: Sender, seen: list[Status]) -> None:
     """What a plain publisher loses at its very end nobody can know: it sends until it is heard."""
     sent = plain.sent
-    wait_until(lambda: seen and seen[-1].gauges.get("ack[plain/lidar]", 0) > sent, 20)
+    wait_until(lambda: seen and seen[-1].gauges.get("ack[plain/lidar]", 0) > sent, SETTLED_S)
 
 
 def checks_the_log(folder: Path, lost: dict[str, int]) -> None:
@@ -138,13 +139,14 @@ def checks_the_log(folder: Path, lost: dict[str, int]) -> None:
 def survives(
     service: Running, senders: dict[str, Sender], seen: list[Status]
 ) -> tuple[str, dict[str, int]]:
-    """Wait until all that was sent is received or counted as lost. Returns the last words, and
-    what each lost."""
+    """Wait until all that was sent is received or counted as lost, and what our publisher sent is
+    received: it may be counted as lost until it comes. Returns the last words, and what each lost.
+    """
     for sender in senders.values():
         sender.stop()
-    wait_until(
-        lambda: all(sum(counted(seen, r)) == s.sent for r, s in senders.items()), timeout_s=20
-    )
+    with suppress(AssertionError):  # who waited in vain is told what was lost
+        wait_until(lambda: counted(seen, "ours") == (senders["ours"].sent, 0), SETTLED_S)
+    wait_until(lambda: all(sum(counted(seen, r)) == s.sent for r, s in senders.items()), SETTLED_S)
     lost = {robot: counted(seen, robot)[1] for robot in senders}
     for sender in senders.values():
         sender.close()
@@ -174,15 +176,17 @@ def test_g14_the_service_stalls(tmp_path: Path) -> None:
     checks_the_log(tmp_path / "log", lost)
 
 
-def outage(folder: Path, seconds: float, scan: Envelope = SCAN) -> None:
-    """F25: the network is down and comes back."""
+def outage(folder: Path, seconds: float, scan: Envelope = SCAN) -> float:
+    """F25: the network is down and comes back. Returns how long after that all are heard again."""
     service = Running(folder)
     try:
         with Proxy(service.endpoint) as network, watched(service.endpoint) as seen:
             senders = {r: Sender(network.endpoint, r, scan) for r in ("ours", "plain")}
             wait_until(lambda: min(counted(seen, r)[0] for r in senders) > 10, 20)
             network.cut()
+            unheard = -senders["plain"].sent
             time.sleep(seconds)  # the fault itself
+            unheard += senders["plain"].sent
             network.restore()
             started = time.monotonic()
             wait_until_heard_again(senders["plain"], seen)
@@ -191,11 +195,11 @@ def outage(folder: Path, seconds: float, scan: Envelope = SCAN) -> None:
     finally:
         service.process.kill()
         service.process.wait()
-    assert back_s <= 5.0 + 1.0  # a status is at most a second old
     assert lost["ours"] == 0
-    assert lost["plain"] >= 0.5 * seconds * RATE_HZ
+    assert lost["plain"] >= unheard - 1 > 0  # one may be under way
     assert f"lost upstream {lost['plain']:,}" in output
     checks_the_log(folder, lost)
+    return back_s
 
 
 def test_g14_the_network_fails(tmp_path: Path) -> None:
@@ -205,4 +209,5 @@ def test_g14_the_network_fails(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_g14_the_network_fails_for_a_minute(tmp_path: Path) -> None:
     """Within the cache of our publisher: 4096 scans, or 64 MB of them."""
-    outage(tmp_path / "log", 60.0, SMALL)
+    back_s = outage(tmp_path / "log", 60.0, SMALL)
+    assert back_s <= 5.0 + 1.0  # a status is at most a second old

@@ -22,6 +22,7 @@ from facet.sources.dialects import (
     split_encoding,
 )
 from facet.sources.naming import is_input, is_static, names_of, source_of
+from facet.sources.recovery import Recovery, asked_in
 from facet_protocol import attachment
 from facet_protocol.messages import Envelope, Loss, ProtocolError
 from facet_protocol.ros_definitions import TRANSFORMS
@@ -186,9 +187,9 @@ class Inbox:
 class LiveSource:
     """Subscribes to every scan, pose and correction of a map's robots, whatever they speak.
 
-    What a stall made us miss on Facet's own keys is asked for again; static transforms are asked
-    for when we come late. `keys` are the foreign keys that are listened to: what is recognised
-    there by the dialect table is taken, the rest is left alone.
+    What a stall made us miss on Facet's own keys is asked for again, until it comes; static
+    transforms are asked for when we come late. `keys` are the foreign keys that are listened to:
+    what is recognised there by the dialect table is taken, the rest is left alone.
     """
 
     def __init__(
@@ -203,7 +204,9 @@ class LiveSource:
         self._dialects = dialects or Dialects()
         self._patterns = [key_pattern(key) for key in keys]
         static = poses_keys(map_id, static=True)
-        self._closers: list[Callable[[], object]] = []
+        self._recovery = Recovery(asked_in(session), self._push_native)
+        self._recovery.start()
+        self._closers: list[Callable[[], object]] = [self._recovery.close]
         for key in (scans_key(map_id), corrections_key(map_id), *poses_keys(map_id), *static):
             self._subscribe(key, self._take_native, with_history=key in static)
         if keys:
@@ -245,6 +248,10 @@ class LiveSource:
 
     def _take_native(self, sample: zenoh.Sample) -> None:
         _keep_thread_state()
+        self._recovery.note(sample)
+        self._push_native(sample)
+
+    def _push_native(self, sample: zenoh.Sample) -> None:
         self._inbox.push(sample, self._dialects.recognise(*_names(sample)))
 
     def _take_foreign(self, sample: zenoh.Sample) -> None:
