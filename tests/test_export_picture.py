@@ -4,11 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 import office
 from facet.export import cutaway
 from facet.export.floorplan import Piece, floor_level, wall_segments
+from facet.export.picture import _draw_legend
 from facet.export.viewpoint import corners, is_overhead, turned, view_rotation, walls_azimuth
+from facet_protocol.messages import PlaneClass
 
 PLANES = {plane.id: plane for plane in office.planes()}
 
@@ -81,3 +84,12 @@ def test_a_slope_that_looks_down_is_overhead():
     assert not is_overhead(ramp)
     assert is_overhead(replace(ramp, facing=-ramp.facing))
     assert [plane.id for plane in PLANES.values() if is_overhead(plane)] == [2]
+
+
+def test_the_legend_names_the_classes_that_are_there():
+    figure = Figure()
+    _draw_legend(figure, {PlaneClass.FLOOR, PlaneClass.WALL})
+    (legend,) = figure.legends
+    said = [text.get_text() for text in legend.get_texts()]
+    assert said[:3] == ["floor", "wall", "cut away to look inside"]
+    assert "other" not in said

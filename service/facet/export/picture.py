@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Sequence, Set
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import shapely
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, PathPatch, Polygon
 from matplotlib.path import Path as Outline
 from numpy.typing import NDArray
@@ -29,6 +31,9 @@ INK = "#2b2e34"
 PALE = "#8a8f98"
 POCHE_M = 0.09  # a wall is drawn this thick, away from the side it was seen from
 LABEL_MIN_M2 = 2.0
+OPENING_TINT = "#cfe4f8"
+DOOR_LINE: dict[str, Any] = {"lw": 1.0, "ls": (0, (3, 2))}
+OFF_CUT_LINE: dict[str, Any] = {"color": PALE, "lw": 0.6, "ls": (0, (4, 3))}
 PLAN_TITLE = f"Plan, cut {CUT_M:g} m above the main floor"
 
 
@@ -100,7 +105,7 @@ def _draw_wall(axes: Axes, plane: Plane, surface: Surface, level: float) -> None
         PIECES[segment.piece](axes, segment)
     if not segments:  # a parapet, a lintel: above or below the cut
         ring = plane.lift(surface.outer)[:, :2]
-        axes.plot(ring[:, 0], ring[:, 1], color=PALE, lw=0.6, ls=(0, (4, 3)), zorder=2)
+        axes.plot(ring[:, 0], ring[:, 1], **OFF_CUT_LINE, zorder=2)
 
 
 def _box(segment: Segment) -> NDArray[np.float64]:
@@ -115,12 +120,12 @@ def _draw_solid(axes: Axes, segment: Segment) -> None:
 def _draw_door(axes: Axes, segment: Segment) -> None:
     tint = _hex(HOLE_COLOURS[HoleKind.OPENING])
     (xa, ya), (xb, yb) = segment.ends
-    axes.plot([xa, xb], [ya, yb], color=tint, lw=1.0, ls=(0, (3, 2)), zorder=3)
+    axes.plot([xa, xb], [ya, yb], color=tint, **DOOR_LINE, zorder=3)
 
 
 def _draw_window(axes: Axes, segment: Segment) -> None:
     tint = _hex(HOLE_COLOURS[HoleKind.OPENING])
-    box = Polygon(_box(segment), facecolor="#cfe4f8", edgecolor=tint, linewidth=0.9, zorder=3)
+    box = Polygon(_box(segment), facecolor=OPENING_TINT, edgecolor=tint, linewidth=0.9, zorder=3)
     axes.add_patch(box)
 
 
@@ -157,11 +162,11 @@ def _draw_measures(axes: Axes, points: NDArray[np.float64], azimuth: float) -> N
     axes.text((low[0] + high[0]) / 2, below, f"{size[0]:.2f} m", **words)
     axes.text(left, (low[1] + high[1]) / 2, f"{size[1]:.2f} m", rotation=90, **words)
     _draw_scale_bar(axes, low[0], below - 1.2 * gap, float(size.max()))
-    _draw_axes_mark(axes, high[0] - gap, below - 1.4 * gap, gap, azimuth)
+    _draw_axes_mark(axes, high[0] - gap, below - 1.9 * gap, 0.8 * gap, azimuth)
     words = {"color": INK, "size": 12, "ha": "center", "va": "bottom"}
     axes.text((low[0] + high[0]) / 2, high[1] + gap / 2, PLAN_TITLE, **words)
     axes.set_xlim(left - gap, high[0] + gap)
-    axes.set_ylim(below - 2.2 * gap, high[1] + 1.5 * gap)
+    axes.set_ylim(below - 2.4 * gap, high[1] + 1.5 * gap)
 
 
 def _draw_scale_bar(axes: Axes, x: float, y: float, extent: float) -> None:
@@ -205,16 +210,21 @@ def _draw_words(figure: Figure, model: Model, planes: Sequence[Plane]) -> None:
     figure.text(
         0.02, 0.015, f"derived digest {model['digest']['derived'][:16]}", size=8.5, color=PALE
     )
-    _draw_legend(figure)
+    _draw_legend(figure, classes.keys() - {PlaneClass.CEILING})
 
 
-def _draw_legend(figure: Figure) -> None:
+def _draw_legend(figure: Figure, shown: Set[PlaneClass]) -> None:
+    """What the colours and lines of both drawings mean; of the classes, those that are there."""
     tint = {kind: _hex(colour) for kind, colour in HOLE_COLOURS.items()}
-    shown = [kind for kind in PlaneClass if kind is not PlaneClass.CEILING]
-    handles = [
-        *(Patch(fc=_hex(CLASS_COLOURS[kind]), ec=INK, label=kind.value) for kind in shown),
+    kinds = [kind for kind in PlaneClass if kind in shown]
+    door = {"color": tint[HoleKind.OPENING], **DOOR_LINE}
+    handles: list[Artist] = [
+        *(Patch(fc=_hex(CLASS_COLOURS[kind]), ec=INK, label=kind.value) for kind in kinds),
+        Line2D([], [], color=PALE, lw=0.6, label="cut away to look inside"),
         Patch(facecolor=INK, label="wall in the cut"),
-        Patch(facecolor="#cfe4f8", edgecolor=tint[HoleKind.OPENING], label="opening"),
+        Line2D([], [], **OFF_CUT_LINE, label="wall above or below it"),
+        Patch(facecolor=OPENING_TINT, edgecolor=tint[HoleKind.OPENING], label="opening"),
+        Line2D([], [], **door, label="opening down to the floor"),
         Patch(fc="white", ec=tint[HoleKind.UNOBSERVED], hatch="////", label="unobserved"),
     ]
     figure.legend(
