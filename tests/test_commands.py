@@ -19,8 +19,10 @@ import zenoh
 from typer.testing import CliRunner
 
 from facet import __version__
-from facet.__main__ import app
-from facet.commands.imports import _nanoseconds
+from facet.__main__ import _said, app
+from facet.commands.demo import _is_alive
+from facet.commands.imports import _nanoseconds, _read_npz, _read_poses
+from facet.commands.terminal import InputError
 from facet.session import client_settings, open_session
 from facet.sinks.log_file import write_recording
 from facet.sources.recording import Recording
@@ -31,7 +33,7 @@ from rig import free_endpoint, room, wait_until
 
 COMMANDS = (
     *("run", "play", "status", "top", "cmd", "replay", "simulate"),
-    *("export", "info", "digest", "recover", "demo", "import"),
+    *("export", "info", "digest", "recover", "config", "demo", "import"),
 )
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
@@ -63,7 +65,7 @@ def log(tmp_path: Path) -> Path:
 @pytest.mark.parametrize("command", COMMANDS)
 def test_every_command_explains_itself(command: str) -> None:
     text = facet(command, "--help")
-    assert f"facet {command}" in text or command in ("top",)  # an example
+    assert f"  facet {command}" in text  # an example
 
 
 def test_version() -> None:
@@ -176,6 +178,45 @@ def test_import_npz(tmp_path: Path) -> None:
     assert np.allclose(second.pose.orientation_xyzw, [0, 0, half, half])
 
 
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"T_world_sensor": np.zeros((2, 4, 4))}, r"T_world_sensor\[0\] is no rotation"),
+        ({"T_world_sensor": np.stack([np.eye(4), 1000 * np.eye(4)])}, r"\[1\] is no rotation"),
+        ({"T_world_sensor": np.diag([-1.0, 1, 1, 1])[None].repeat(2, 0)}, "is no rotation"),
+        ({"lengths": np.array([10, 21])}, r"sum to 31, points \(30, 3\)"),
+        ({"points": np.zeros((30, 2))}, r"points \(30, 2\)"),
+        ({"stamp_ns": None}, "stamp_ns .* needed are stamp_ns, T_world_sensor, points, lengths"),
+    ],
+)
+def test_an_npz_that_does_not_fit_is_named(
+    tmp_path: Path, change: dict[str, Any], said: str
+) -> None:
+    arrays = {
+        "stamp_ns": np.array([5, 9]),
+        "T_world_sensor": np.stack([np.eye(4), np.eye(4)]),
+        "points": np.zeros((30, 3)),
+        "lengths": np.array([10, 20]),
+    } | change
+    np.savez(tmp_path / "a.npz", **{k: v for k, v in arrays.items() if v is not None})
+    with pytest.raises(InputError, match=said):
+        _read_npz(tmp_path / "a.npz")
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        ("1 0 0 1 0 0 0 1 9", "9 numbers, 8 are stamp x y z qx qy qz qw"),
+        ("1 0 0 one 0 0 0 1", "'one'; a line is stamp x y z qx qy qz qw"),
+        ("1 0 0 1 0 0 0 0", "has not the length 1"),
+    ],
+)
+def test_a_pose_that_is_none_is_named(tmp_path: Path, line: str, said: str) -> None:
+    (tmp_path / "poses.txt").write_text(line)
+    with pytest.raises(InputError, match=rf"poses\.txt:1: .*{said}"):
+        _read_poses(tmp_path / "poses.txt")
+
+
 @pytest.mark.skipif(not DATA.exists(), reason="the shared recordings are not here")
 def test_import_a_real_recording(tmp_path: Path) -> None:
     facet("import", DATA / "rooms.npz", tmp_path / "rooms.mcap")
@@ -240,7 +281,12 @@ def test_stamps_are_exact() -> None:
         (("replay", __file__, "--update-every", "never"), 2, "never"),
         (("run", "--listen", "tcp/0.0.0.0:7447"), 78, "open to the network"),
         (("run", "--viewer", "vr"), 78, "viewer"),
-        (("status", "--connect", "tcp/127.0.0.1:9"), 74, "onnect"),
+        (("run", "--listen", "127.0.0.1:7447"), 78, "PROTOCOL/HOST:PORT"),
+        (("run", "--record", __file__), 65, "the log needs a folder"),
+        (("status", "--connect", "tcp/127.0.0.1:9"), 74, "nobody answers at tcp/127.0.0.1:9"),
+        (("cmd", "export", "glb"), 2, "'glb' is not key=value"),
+        (("simulate", "x.mcap", "--range-noise", "-1"), 2, "--range-noise"),
+        (("simulate", "x.mcap", "--speed", "0"), 2, "--speed"),
         (("simulate", "x.mcap", "--scene", "castle"), 2, "castle"),
     ],
 )
@@ -252,7 +298,24 @@ def test_exit_codes(
     assert result.returncode == code, result.stderr
     assert said in result.stderr
     assert "Traceback" not in result.stderr
+    assert ".rs:" not in result.stderr  # where in a library's source
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_the_system_refuses_is_said_without_its_numbers() -> None:
+    assert _said(PermissionError(13, "Permission denied", "/data")) == "/data: Permission denied"
+    moved = FileExistsError(17, "File exists", "a.part", None, "a")
+    assert _said(moved) == "a.part -> a: File exists"
+    assert _said(OSError("no port is free")) == "no port is free"
+    assert _said(zenoh.ZError("invalid port at /home/x/lib.rs:62.")) == "invalid port"
+
+
+def test_the_demo_does_not_wait_for_a_service_that_has_ended() -> None:
+    class Ended:
+        def poll(self) -> int:
+            return 1
+
+    assert not _is_alive(None, Ended(), float("inf"))  # type: ignore[arg-type]
 
 
 class Running:
@@ -308,6 +371,25 @@ def test_run_play_stop_replay(log: Path, tmp_path: Path) -> None:
     model = json.loads((tmp_path / "log" / "model.json").read_text())
     assert hashes(facet("replay", tmp_path / "log")) == model["digest"]
     assert hashes(facet("replay", log, "--voxel", 0.1)) == model["digest"]
+
+
+def test_who_asks_for_the_wrong_map_learns_the_right_one(log: Path, tmp_path: Path) -> None:
+    service = Running(tmp_path / "log")
+    here = ("--connect", service.endpoint)
+    try:
+        status = process("status", "--map", "hall", *here)
+        played = process("play", log, "--speed", "max", "--map", "hall", *here)
+        refused = process("cmd", "export", "format=stl", *here)
+        second = process("run", "--listen", service.endpoint, "--record", tmp_path / "b")
+    finally:
+        service.process.kill()
+        service.process.communicate()
+    missing = f"no service maps 'hall' at {service.endpoint}; --map map would find one"
+    assert (status.returncode, missing in status.stderr) == (65, True), status.stderr
+    assert missing in played.stderr
+    assert (refused.returncode, "'stl' is not one of" in refused.stderr) == (65, True)
+    assert second.returncode == 74
+    assert f"{service.endpoint} is taken" in second.stderr
 
 
 def test_killed_at_any_moment_the_log_is_whole_chunks(log: Path, tmp_path: Path) -> None:

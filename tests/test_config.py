@@ -2,11 +2,20 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
-from facet.config import ConfigError, is_loopback, load_config, load_credentials
+from facet.commands.configuration import toml_of
+from facet.config import (
+    Config,
+    ConfigError,
+    Section,
+    is_loopback,
+    load_config,
+    load_credentials,
+)
 
 
 def load(tmp_path: Path, text: str) -> object:
@@ -38,6 +47,11 @@ def test_options_come_over_the_file(tmp_path: Path) -> None:
         ('viewer = "wbe"', "viewer: must be off, web, native"),
         ('[record]\ncompression = "gz"', "record.compression = 'gz'"),
         ("x = [", "facet.toml"),
+        ("map = 3", r"map = 3: should be a table, that is a line \[map\]"),
+        ("[mapping]\nvoxel_m = 5", r"voxel_m = 5: allowed is >= 0.005 and <= 1.0 m$"),
+        ('[network]\nlisten = ["127.0.0.1:7447"]', "'127.0.0.1:7447' is no endpoint: .*tcp/"),
+        ('[network]\nconnect = ["tcp/localhost"]', "'tcp/localhost' is no endpoint"),
+        ('[network]\nlisten = ["tcp/127.0.0.1:77777"]', "is no endpoint"),
     ],
 )
 def test_what_is_wrong_is_named(tmp_path: Path, text: str, said: str) -> None:
@@ -48,6 +62,24 @@ def test_what_is_wrong_is_named(tmp_path: Path, text: str, said: str) -> None:
 def test_a_file_that_is_not_there_is_named(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"nowhere\.toml"):
         load_config(tmp_path / "nowhere.toml")
+
+
+def test_everything_that_can_be_set_is_printed_and_read_back(tmp_path: Path) -> None:
+    """`facet config`: what it prints is a file that says the same."""
+    text = "\n".join(toml_of(load_config()))
+    assert load(tmp_path, text) == load_config()
+    for name, section in Config():
+        for key in type(section).model_fields if isinstance(section, Section) else (name,):
+            assert re.search(rf"^(# )?{key} =", text, re.MULTILINE), key
+    assert re.search(r"^# voxel_m = 0\.05 .*>= 0\.005 and <= 1\.0 m$", text, re.MULTILINE)
+
+
+def test_rules_are_printed_as_the_tables_they_are(tmp_path: Path) -> None:
+    rules = "".join(f'[[robots.rules]]\nkey = "{k}/**"\nframe = \'a "b\'\n' for k in "xy")
+    config = load(tmp_path, f"{rules}[record]\nresume = false")
+    assert isinstance(config, Config)
+    assert len(config.robots.rules) == 2
+    assert load(tmp_path, "\n".join(toml_of(config))) == config
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import sys
 
 import typer
 import zenoh
 
 from facet import __version__
+from facet.commands.configuration import config
 from facet.commands.demo import demo
 from facet.commands.export import export
 from facet.commands.imports import import_
@@ -32,7 +34,14 @@ app = typer.Typer(
     rich_markup_mode=None,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-LIVE, FILES = (run, play, status, top, cmd), (replay, simulate, export, info, digest, recover, demo)
+# Zenoh's own words end with the line of its source; what they begin with tells what was tried
+_SOURCE = re.compile(r" at \S+\.rs:\d+\.?")
+_NOBODY = re.compile(r"Unable to connect to any of \[\w+\((.*?)\)\]")
+_TAKEN = re.compile(r"bound to (\S+): .*Address already in use")
+LIVE, FILES = (
+    (run, play, status, top, cmd),
+    (replay, simulate, export, info, digest, recover, config, demo),
+)
 for command in (*LIVE, *FILES):
     app.command()(command)
 app.command("import")(import_)
@@ -73,8 +82,32 @@ def _run() -> int:
 
 
 def _fail(code: Exit, error: Exception) -> Exit:
-    err.print(f"facet: {error}", style="bold red", markup=False)
+    err.print(f"facet: {_said(error)}", style="bold red", markup=False)
     return code
+
+
+def _said(error: Exception) -> str:
+    """The failure in the words of who typed the command: what was tried, and what to do."""
+    if isinstance(error, zenoh.ZError):
+        return _network_said(str(error))
+    if isinstance(error, OSError) and error.filename is not None:
+        names = (str(n) for n in (error.filename, error.filename2) if n is not None)
+        return f"{' -> '.join(names)}: {error.strerror}"
+    return str(error)
+
+
+def _network_said(text: str) -> str:
+    if nobody := _NOBODY.search(text):
+        return (
+            f"nobody answers at {nobody[1]}: `facet run` starts a service; "
+            "--connect names another address"
+        )
+    if taken := _TAKEN.search(text):
+        return (
+            f"{taken[1]} is taken, by another service perhaps: --listen names another, "
+            "as in --listen tcp/127.0.0.1:7448"
+        )
+    return _SOURCE.sub("", text)
 
 
 if __name__ == "__main__":

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 RECORDINGS = Path(__file__).parents[3] / "recordings"
 MAP = "demo"
-READY_S = 120.0  # the first start compiles
+READY_S = 900.0  # the first start compiles: minutes, on a busy machine
 QUIET_S = 20.0  # nothing new is applied for so long: something is stuck
 ENDING_S = 15.0
 
@@ -46,6 +46,10 @@ def demo(
     speed: Annotated[str, typer.Option(help="How fast it is played: N times, or max.")] = "20",
 ) -> None:
     """Watch a robot map a building: no robot, no building and no network needed.
+
+    \b
+    facet demo
+    facet demo --recording my.mcap --speed max --out out/mine
 
     A robot's recording is played over Zenoh into the service, as a robot would send it; what comes
     out lies in out/demo: the log, the model, a picture, and a recording for Rerun.
@@ -67,7 +71,10 @@ def demo(
 def _bundled() -> Path:
     recordings = sorted(RECORDINGS.glob("office*.mcap")) or sorted(RECORDINGS.glob("*.mcap"))
     if not recordings:
-        raise InputError(f"no recording in {RECORDINGS}: `make recordings` makes them")
+        raise InputError(
+            f"no recording in {RECORDINGS}: `facet simulate a.mcap` makes one, "
+            "`facet demo --recording a.mcap` plays it"
+        )
     return recordings[0]
 
 
@@ -115,21 +122,21 @@ def _connected(
     import zenoh
 
     deadline = time.monotonic() + READY_S
-    if err.is_terminal:
-        err.print("starting the service; the first time it is compiled, for half a minute")
+    err.print("starting the service; the first time it compiles, for a minute or more")
     while running.poll() is None and time.monotonic() < deadline:
         try:
             with open_session(client_settings(endpoint)) as session:
-                if _is_alive(session, deadline):
+                if _is_alive(session, running, deadline):
                     yield session
                     return
         except zenoh.ZError:
             time.sleep(0.1)
-    raise InputError(f"the service did not start: see {log}")
+    why = f"is not there after {READY_S:.0f} s" if running.poll() is None else "did not start"
+    raise InputError(f"the service {why}: see {log}")
 
 
-def _is_alive(session: zenoh.Session, deadline: float) -> bool:
-    while time.monotonic() < deadline:
+def _is_alive(session: zenoh.Session, running: subprocess.Popen[bytes], deadline: float) -> bool:
+    while running.poll() is None and time.monotonic() < deadline:
         if list(session.liveliness().get(topics.alive_key(MAP), timeout=1.0)):
             return True
         time.sleep(0.05)

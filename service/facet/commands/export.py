@@ -13,11 +13,12 @@ from facet.config import Config
 
 def export(
     file: Annotated[
-        Path, typer.Argument(metavar="MODEL|LOG", help="model.json, or a log (.mcap).")
+        Path, typer.Argument(metavar="MODEL|LOG", help="model.json, or a log (.mcap) to replay.")
     ],
     out_file: Annotated[Path, typer.Argument(metavar="OUT", help="The file to write.")],
     file_format: Annotated[
-        str | None, typer.Option("--format", help="json | ply | glb | png; by OUT's ending.")
+        str | None,
+        typer.Option("--format", help="json | ply | glb | png.", show_default="OUT's ending"),
     ] = None,
 ) -> None:
     """Write a map in another format.
@@ -25,14 +26,20 @@ def export(
     \b
     facet export out/log/model.json rooms.glb      # surfaces, for any 3-D program
     facet export out/log points.ply                # a log also has its points
-    facet export out/log/model.json plan.png
+    facet export out/log/model.json rooms.ply      # a model: its surfaces, as triangles
+    facet export out/log/model.json plan.png       # a view and a plan, with measures
+
+    Lengths are metres, z is up; in glb, as its standard demands, y. Exit code 3: the log was
+    damaged, or scans of it were left out.
     """
     from facet.export.formats import FORMATS
     from facet.export.model import read_model
 
     name = file_format or out_file.suffix.removeprefix(".")
     if name not in FORMATS:
-        raise typer.BadParameter(f"{name!r} is not one of {', '.join(FORMATS)}")
+        raise typer.BadParameter(
+            f"{name!r} is not one of {', '.join(FORMATS)}", param_hint="--format"
+        )
     existing([file])
     code = Exit.CLEAN
     if file.suffix == ".json":

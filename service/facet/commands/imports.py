@@ -16,6 +16,8 @@ from facet.commands.terminal import InputError, existing, megabytes, out, progre
 from facet.sinks.log_file import write_recording
 from facet_protocol.messages import Envelope, Pose, Scan, ScanKind
 
+RIGID = 1e-3  # how far a rotation may be from one, in any element of R Rᵀ
+POSE_LINE = "stamp x y z qx qy qz qw"
 NONE = np.zeros((0, 3), dtype=np.float32)
 
 
@@ -34,7 +36,8 @@ def import_(
     ],
     out_file: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The recording.")],
     poses: Annotated[
-        Path | None, typer.Option(help="Lines `stamp x y z qx qy qz qw` (TUM), one a cloud.")
+        Path | None,
+        typer.Option(help=f"Lines `{POSE_LINE}` (TUM: seconds, metres), one a cloud."),
     ] = None,
     robot: Annotated[str, typer.Option(help="Name of the robot.")] = "import",
     sensor: Annotated[str, typer.Option(help="Name of the sensor.")] = "cloud",
@@ -46,6 +49,9 @@ def import_(
     facet import corridor.npz corridor.mcap        # stamp_ns, T_world_sensor, points, lengths
     facet import clouds/ a.mcap --poses poses.txt  # *.ply or *.pcd in the order of their names
     facet import scan.ply a.mcap                   # one cloud, taken at the origin of its frame
+
+    Points are metres in the sensor's frame. The arrays of an .npz of S scans: stamp_ns (S,),
+    T_world_sensor (S, 4, 4), points (N, 3) of all scans one after the other, lengths (S,).
     """
     existing([source] + ([poses] if poses else []))
     num_scans, clouds = _open(source, poses)
@@ -105,16 +111,36 @@ def _read_npz(path: Path) -> tuple[int, Iterator[PosedCloud]]:
         with np.load(path, allow_pickle=False) as data:
             stamps, transforms = data["stamp_ns"], data["T_world_sensor"]
             points, lengths = data["points"].astype(np.float32, copy=False), data["lengths"]
-    except (OSError, ValueError, KeyError) as error:
+    except KeyError as error:
+        raise InputError(
+            f"{path}: {error.args[0]}; needed are stamp_ns, T_world_sensor, points, lengths"
+        ) from error
+    except (OSError, ValueError) as error:
         raise InputError(f"{path}: {error}") from error
-    num = len(stamps)
-    if transforms.shape != (num, 4, 4) or lengths.shape != (num,) or lengths.sum() != len(points):
-        raise InputError(f"{path}: {num} stamps, poses {transforms.shape}, {len(points)} points")
+    num, told = stamps.size, int(lengths.sum())
+    shapes = (stamps.shape, transforms.shape, lengths.shape, points.shape)
+    if shapes != ((num,), (num, 4, 4), (num,), (told, 3)) or (lengths < 0).any():
+        raise InputError(
+            f"{path}: stamp_ns {shapes[0]}, T_world_sensor {shapes[1]}, lengths {shapes[2]} that "
+            f"sum to {told:,}, points {shapes[3]}: they do not fit each other"
+        )
+    _require_rigid(path, transforms)
     ends = np.cumsum(lengths)
     return num, (
         PosedCloud(int(stamps[k]), _pose_of(transforms[k]), points[ends[k] - lengths[k] : ends[k]])
         for k in range(num)
     )
+
+
+def _require_rigid(path: Path, transforms: NDArray[np.float64]) -> None:
+    """Raises InputError for a pose that turns the room inside out, or stretches it."""
+    R = transforms[:, :3, :3].astype(np.float64)
+    off = np.abs(R @ R.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
+    is_bad = ~(off < RIGID) | ~(np.linalg.det(R) > 0.0) | ~np.isfinite(transforms).all(axis=(1, 2))
+    if is_bad.any():
+        raise InputError(
+            f"{path}: T_world_sensor[{np.flatnonzero(is_bad)[0]}] is no rotation and translation"
+        )
 
 
 def _pose_of(T_world_sensor: NDArray[np.float64]) -> Pose:
@@ -136,9 +162,11 @@ def _read_poses(path: Path) -> list[tuple[int, Pose]]:
             values = np.array([float(word) for word in words[1:]])
             stamp_ns = _nanoseconds(words[0])
         except ValueError as error:
-            raise InputError(f"{path}:{number}: {error}") from error
+            raise InputError(f"{path}:{number}: {error}; a line is {POSE_LINE}") from error
         if len(values) != 7:
-            raise InputError(f"{path}:{number}: {len(words)} numbers, expected 8")
+            raise InputError(f"{path}:{number}: {len(words)} numbers, 8 are {POSE_LINE}")
+        if not abs(np.linalg.norm(values[3:]) - 1.0) < RIGID:
+            raise InputError(f"{path}:{number}: qx qy qz qw {values[3:]} has not the length 1")
         posed.append((stamp_ns, Pose(values[:3], values[3:])))
     return posed
 

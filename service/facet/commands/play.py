@@ -11,6 +11,7 @@ import typer
 import zenoh
 import zenoh.ext
 
+from facet.commands.talk import CredentialsOption, maps_at, no_service
 from facet.commands.terminal import err, existing, out, progress
 from facet.session import DEFAULT_ENDPOINT, client_settings, open_session
 from facet.sources.naming import (
@@ -134,10 +135,7 @@ def play(
     robot: Annotated[str | None, typer.Option(help="Publish under this robot's name.")] = None,
     map_id: Annotated[str, typer.Option("--map", help="The map to add to.")] = "map",
     connect: Annotated[str, typer.Option(help="The service's endpoint.")] = DEFAULT_ENDPOINT,
-    credentials: Annotated[
-        Path | None,
-        typer.Option(envvar="FACET_CREDENTIALS", help="What to show at a guarded endpoint (TOML)."),
-    ] = None,
+    credentials: CredentialsOption = None,
     shared_memory: Annotated[bool, typer.Option(help="Large scans by shared memory.")] = True,
 ) -> None:
     """Publish a recording over Zenoh, as the robot would; of ROS 2 too, with its transforms.
@@ -145,7 +143,7 @@ def play(
 
     \b
     facet run &                                    # somebody has to listen
-    facet play recordings/office.mcap              # as it was recorded
+    facet play recordings/office-pushbroom.mcap    # as it was recorded
     facet play a.mcap --robot second --speed 10    # another robot, ten times as fast
     """
     rate = parse_speed(speed)
@@ -154,6 +152,9 @@ def play(
     recording = Recording(existing(logs))
     settings = client_settings(connect, shared_memory, credentials)
     with open_session(settings) as session, progress("playing", _count(logs)) as bar:
+        maps = maps_at(session)
+        if maps and map_id not in maps:  # behind an access table nothing may be seen
+            err.print(no_service(session, map_id, connect))
         publisher = RobotPublisher(session, map_id)
         num = 0
         try:
@@ -174,7 +175,7 @@ def parse_speed(text: str) -> float:
         speed = -1.0
     if not 0.0 < speed < float("inf"):
         raise typer.BadParameter(
-            f"{text!r} is neither a number above 0 nor max", param_hint="speed"
+            f"{text!r} is neither a number above 0 nor max", param_hint="--speed"
         )
     return speed
 

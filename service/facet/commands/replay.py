@@ -184,7 +184,9 @@ def parse_every(text: str) -> int:
     except ValueError:
         seconds = -1.0
     if not 0.0 < seconds < 1e9:
-        raise typer.BadParameter(f"{text!r} is neither seconds above 0, nor log, nor end")
+        raise typer.BadParameter(
+            f"{text!r} is neither seconds above 0, nor log, nor end", param_hint="--update-every"
+        )
     return int(seconds * 1e9)
 
 
@@ -197,7 +199,7 @@ def replay(
         str, typer.Option(help="max: as fast as it goes; 1: as recorded; N: N times.")
     ] = "max",
     update_every: Annotated[
-        str, typer.Option(help="log: where the log says, else every 0.2 s; seconds; or end.")
+        str, typer.Option(help="log: where the log says, else every 0.2 s; seconds; end: once.")
     ] = "log",
     viewer: Annotated[
         str, typer.Option(help="off | rrd (beside the model) | FILE.rrd, for Rerun.")
@@ -205,8 +207,10 @@ def replay(
     updates: Annotated[
         Path | None, typer.Option(help="Write every update to this MCAP file.")
     ] = None,
-    report: Annotated[bool, typer.Option("--report", help="The four-stage table.")] = False,
-    config: Annotated[Path | None, typer.Option(help="Settings (TOML).")] = None,
+    report: Annotated[bool, typer.Option("--report", help="The paper's four-stage table.")] = False,
+    config: Annotated[
+        Path | None, typer.Option(help="Settings (TOML): see `facet config`.")
+    ] = None,
     frame: FrameOption = None,
     reject_jumps: RejectJumpsOption = None,
     strict: StrictOption = None,
@@ -221,7 +225,8 @@ def replay(
     facet replay a.mcap --out out/a --viewer rrd   # with a picture and a recording for Rerun
     facet replay a.mcap --voxel 0.1 --update-every end
 
-    A log that was cut off is read as far as it goes. Exit code 3: something was lost or left out.
+    A log that was cut off is read as far as it goes; its settings hold where no other is given.
+    Exit code 3: something was lost or left out.
     """
     overrides = {
         "map.frame": frame,
@@ -261,7 +266,9 @@ def _rrd_path(viewer: str, out_dir: Path | None) -> Path | None:
         return (out_dir or Path("out")) / "map.rrd"
     if viewer.endswith(".rrd"):
         return Path(viewer)
-    raise typer.BadParameter(f"{viewer!r} is neither off, rrd nor a file that ends in .rrd")
+    raise typer.BadParameter(
+        f"{viewer!r} is neither off, rrd nor a file that ends in .rrd", param_hint="--viewer"
+    )
 
 
 def _sinks(rrd: Path | None, updates: Path | None) -> list[Sink]:
@@ -296,6 +303,11 @@ def print_result(result: Replayed, model: Model) -> None:
     if result.num_left_out:
         reasons = ", ".join(f"{num:,} {name}" for name, num in result.left_out.items())
         err.print(f"left out: {reasons}")
+    if "no_pose" in result.left_out:
+        err.print(
+            "no_pose: no transforms lead from these scans to the map's frame; --frame names "
+            "another, `facet info` shows whether the log has transforms"
+        )
     table("map", ("what", "value"), summary(model, result.wall_s, result.log_s))
     out.print(f"state   {model['digest']['state']}")
     out.print(f"derived {model['digest']['derived']}")

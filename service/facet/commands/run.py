@@ -26,7 +26,7 @@ from facet.commands.settings import (
     mapping_overrides,
     robots_overrides,
 )
-from facet.commands.terminal import Exit, out, set_up_logging, table
+from facet.commands.terminal import Exit, InputError, out, set_up_logging, table
 from facet.config import Config, load_config
 from facet.session import client_endpoint, open_session, service_settings
 
@@ -39,22 +39,38 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 WATCH_S = 0.5
+PATIENCE_S = 5.0  # from the cache it takes one
 VIEWER_EXIT_S = 1.5
 
 
 def run(
-    config: Annotated[Path | None, typer.Option(help="Settings (TOML).")] = None,
-    map_id: Annotated[str | None, typer.Option("--map", help="Name of the map.")] = None,
-    listen: Annotated[
-        list[str] | None, typer.Option(help="Endpoint to listen on; again for more.")
+    config: Annotated[
+        Path | None, typer.Option(help="Settings (TOML): see `facet config`.")
     ] = None,
-    connect: Annotated[list[str] | None, typer.Option(help="Router to connect to.")] = None,
-    record: Annotated[Path | None, typer.Option(help="Folder of the log.")] = None,
+    map_id: Annotated[
+        str | None, typer.Option("--map", help="Name of the map.", show_default="map")
+    ] = None,
+    listen: Annotated[
+        list[str] | None,
+        typer.Option(
+            help="Endpoint to listen on; again for more.", show_default="tcp/127.0.0.1:7447"
+        ),
+    ] = None,
+    connect: Annotated[
+        list[str] | None, typer.Option(help="Router to connect to; again for more.")
+    ] = None,
+    record: Annotated[
+        Path | None, typer.Option(help="Folder of the log.", show_default="out/log")
+    ] = None,
     viewer: Annotated[
-        str | None, typer.Option(help="off | web | native | connect:URL of a Rerun viewer.")
+        str | None,
+        typer.Option(
+            help="off | web | native | connect:URL of a Rerun viewer.", show_default="off"
+        ),
     ] = None,
     on_full: Annotated[
-        str | None, typer.Option(help="When the disk fails: retry | exit (with 74).")
+        str | None,
+        typer.Option(help="When the disk fails: retry | exit (with 74).", show_default="retry"),
     ] = None,
     fast: Annotated[
         bool, typer.Option("--fast", help="Do not wait for the disk: no power cut is survived.")
@@ -79,8 +95,8 @@ def run(
     Scans come in on facet/v1/<map>/robot/<robot>/scan/<sensor>. What is not in the log is not in
     the map. A folder that holds this map's log is gone on with: from the last checkpoint, else from
     the whole log, to the same map with the same ids; other settings than the log's are applied to
-    all of it. At the end the log is finished, with a checkpoint and model.json beside it. Exit
-    code 3: scans were lost, the table says how many.
+    all of it. At the end the log is finished, with a checkpoint and model.json beside it. The
+    first start compiles for a minute or two. Exit code 3: scans were lost, the table says how many.
     """
     set_up_logging()
     overrides = {
@@ -106,9 +122,12 @@ def serve(config: Config) -> Exit:
     from facet.sinks.recorder import single_writer
     from facet.warmup import warm_up
 
+    if config.record.directory.is_file():
+        raise InputError(f"{config.record.directory} is a file: the log needs a folder")
     mapper = make_mapper(config)
     with single_writer(config.record.directory), stop_signals() as stop:
-        warm_up(mapper.settings)
+        with _said_if_slow("compiling the mapper's loops, once: this takes a minute or two"):
+            warm_up(mapper.settings)
         try:
             resumed = _resume(config, mapper, stop)
         except Stopped:
@@ -126,6 +145,17 @@ def serve(config: Config) -> Exit:
                 if model is not None:
                     write_model(model, config.record.directory / "model.json")
         return _conclude(service, model)
+
+
+@contextmanager
+def _said_if_slow(text: str) -> Iterator[None]:
+    """Log the text when what is done takes longer than PATIENCE_S."""
+    timer = threading.Timer(PATIENCE_S, logger.info, (text,))
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def _resume(config: Config, mapper: Mapper, stop: threading.Event) -> Resumed:

@@ -17,14 +17,31 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
-VoxelOption = Annotated[float | None, typer.Option("--voxel", help="Voxel edge in metres.")]
+VoxelOption = Annotated[
+    float | None,
+    typer.Option(
+        "--voxel", help="Voxel edge, 0.005 to 1 m.", show_default="0.05; replay: the log's"
+    ),
+]
 ThetaOption = Annotated[
-    float | None, typer.Option("--theta", help="Largest thickness angle of a normal, in degrees.")
+    float | None,
+    typer.Option(
+        "--theta",
+        help="Largest thickness angle of a normal, 1 to 45 degrees.",
+        show_default="15; replay: the log's",
+    ),
 ]
 DetailOption = Annotated[
-    float | None, typer.Option("--detail-level", help="Share of the voxels that planes must hold.")
+    float | None,
+    typer.Option(
+        "--detail-level",
+        help="Share of the voxels that planes must hold, 0.5 to 1.",
+        show_default="0.98; replay: the log's",
+    ),
 ]
-FrameOption = Annotated[str | None, typer.Option(help="Frame that poses are given in.")]
+FrameOption = Annotated[
+    str | None, typer.Option(help="Frame that poses lead to.", show_default="the log's, else map")
+]
 
 RejectJumpsOption = Annotated[
     bool | None,

@@ -14,24 +14,42 @@ from facet_protocol.codec import encode
 from facet_protocol.messages import Envelope, LineFan, Scan
 from facet_protocol.topics import scan_key
 
+LEAST = 0.001  # m/s, and scans a second: nothing moves at 0
+
 
 def simulate(
     out_file: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The recording.")],
-    scene: Annotated[str, typer.Option(help="What is driven through.")] = "office",
+    scene: Annotated[str, typer.Option(help="office | corridor | hall | hall85k")] = "office",
     sensor: Annotated[str, typer.Option(help="lidar3d | pushbroom | depth")] = "pushbroom",
-    range_noise: Annotated[float, typer.Option(help="m, standard deviation along a beam.")] = 0.012,
-    pose_noise: Annotated[float, typer.Option(help="m, of each axis of a position.")] = 0.008,
-    heading_noise: Annotated[float, typer.Option(help="degrees, of the heading.")] = 0.0,
-    seed: Annotated[int, typer.Option(help="The same seed, the same recording.")] = 0,
-    duration: Annotated[float | None, typer.Option(help="s; the whole drive otherwise.")] = None,
-    max_points: Annotated[int | None, typer.Option(help="Spread this many over the drive.")] = None,
-    speed: Annotated[float | None, typer.Option(help="m/s; the sensor's own otherwise.")] = None,
-    rate: Annotated[float | None, typer.Option(help="Scans a second.")] = None,
+    range_noise: Annotated[
+        float, typer.Option(min=0.0, help="m, standard deviation along a beam.")
+    ] = 0.012,
+    pose_noise: Annotated[
+        float, typer.Option(min=0.0, help="m, standard deviation of each axis of a position.")
+    ] = 0.008,
+    heading_noise: Annotated[
+        float, typer.Option(min=0.0, help="degrees, standard deviation of the heading.")
+    ] = 0.0,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed, the same recording.")] = 0,
+    duration: Annotated[
+        float | None, typer.Option(min=0.0, help="s.", show_default="the whole drive")
+    ] = None,
+    max_points: Annotated[
+        int | None, typer.Option(min=1, help="Spread so many points over the whole drive.")
+    ] = None,
+    speed: Annotated[
+        float | None,
+        typer.Option(min=LEAST, help="m/s, how fast it drives.", show_default="the sensor's own"),
+    ] = None,
+    rate: Annotated[
+        float | None,
+        typer.Option(min=LEAST, help="Scans a second.", show_default="the sensor's own"),
+    ] = None,
     robot: Annotated[str, typer.Option(help="Name of the robot.")] = "sim",
     map_id: Annotated[str, typer.Option("--map", help="Name of the map.")] = "map",
     compression: Annotated[str, typer.Option(help="lz4 | zstd | none")] = "lz4",
 ) -> None:
-    """Simulate a drive; writes the truth beside the recording, as OUT.truth.json.
+    """Simulate a robot's drive. The truth is written beside the recording, as OUT.truth.json.
 
     \b
     facet simulate office.mcap                                  # push-broom through an office
@@ -95,4 +113,6 @@ def envelope_of(message: Scan | LineFan, map_id: str) -> Envelope:
 def _check(name: str, value: str, known: object) -> None:
     names = list(known)  # type: ignore[call-overload]
     if value not in names:
-        raise typer.BadParameter(f"{value!r} is not one of {', '.join(names)}", param_hint=name)
+        raise typer.BadParameter(
+            f"{value!r} is not one of {', '.join(names)}", param_hint=f"--{name}"
+        )

@@ -23,6 +23,7 @@ from facet_protocol.messages import ProtocolError, Status
 from facet_protocol.records import decode_status
 
 WAIT_S = 3.0  # the service speaks once a second
+EVERYONE = topics.alive_key("_").replace("/_/", "/*/")
 MapOption = Annotated[str, typer.Option("--map", help="Name of the map.")]
 ConnectOption = Annotated[str, typer.Option(help="The service's endpoint.")]
 CredentialsOption = Annotated[
@@ -49,23 +50,38 @@ def _next(subscriber: zenoh.Subscriber[zenoh.handlers.Handler[zenoh.Sample]]) ->
     return None
 
 
+def maps_at(session: zenoh.Session) -> list[str]:
+    """The maps whose services are there, by name."""
+    place = EVERYONE.split("/").index("*")
+    replies = session.liveliness().get(EVERYONE, timeout=WAIT_S)
+    return sorted({str(r.ok.key_expr).split("/")[place] for r in replies if r.ok is not None})
+
+
+def no_service(session: zenoh.Session, map_id: str, endpoint: str) -> str:
+    """That nobody makes this map, and which maps somebody makes."""
+    maps = maps_at(session)
+    instead = f"; --map {' or '.join(maps)} would find one" if maps else ""
+    return f"no service maps {map_id!r} at {endpoint}{instead}"
+
+
 def status(
     map_id: MapOption = "map",
     connect: ConnectOption = DEFAULT_ENDPOINT,
     credentials: CredentialsOption = None,
 ) -> None:
-    """How a running service is.
+    """How a running service is: what it has counted, what it holds, what its stages take.
 
     \b
     facet status
     facet status --map hall --connect tcp/127.0.0.1:7448
 
-    Exit code 3: it lives, but its health is not OK; 74: nobody answers.
+    Exit code 3: it lives, but its health is not OK; 65: somebody answers, but does not make this
+    map; 74: nobody answers.
     """
     with open_session(client_settings(connect, credentials=credentials)) as session:
         current = next(statuses(session, map_id))
         if current is None:
-            raise InputError(f"no service maps {map_id!r} at {connect}")
+            raise InputError(no_service(session, map_id, connect))
         out.print(_table(current))
     raise typer.Exit(Exit.CLEAN if current.health == "OK" else Exit.LOST)
 
@@ -75,21 +91,26 @@ def top(
     connect: ConnectOption = DEFAULT_ENDPOINT,
     credentials: CredentialsOption = None,
 ) -> None:
-    """The same, every second, until Ctrl-C."""
+    """Watch a running service: what `facet status` says, every second, until Ctrl-C.
+
+    \b
+    facet top
+    facet top --map hall --connect tcp/127.0.0.1:7448
+    """
     with (
         open_session(client_settings(connect, credentials=credentials)) as session,
         Live(console=out, screen=out.is_terminal, auto_refresh=False) as live,
     ):
         for current in statuses(session, map_id):
             if current is None:
-                err.print(f"no word from {map_id!r} at {connect}")
+                err.print(no_service(session, map_id, connect))
             else:
                 live.update(_table(current), refresh=True)
 
 
 def cmd(
     name: Annotated[str, typer.Argument(help=" | ".join(topics.COMMANDS))],
-    parameters: Annotated[list[str] | None, typer.Argument(help="key=value")] = None,
+    parameters: Annotated[list[str] | None, typer.Argument(help="key=value, as above.")] = None,
     map_id: MapOption = "map",
     connect: ConnectOption = DEFAULT_ENDPOINT,
     credentials: CredentialsOption = None,
@@ -97,27 +118,33 @@ def cmd(
     """Tell a running service what to do.
 
     \b
-    facet cmd pause
-    facet cmd export format=glb
-    facet cmd record                 # start a new log file; the others can be copied
+    facet cmd pause                  # scans are recorded, but wait: the map stays as it is
+    facet cmd resume                 # they are mapped again
     facet cmd checkpoint             # the next start goes on from here
+    facet cmd record                 # start a new log file; the others can be copied
+    facet cmd export format=glb      # json (the default), ply, glb or png, beside the log
     facet cmd erase robot=r1 first=40 last=90   # take scans out, as if they had never come
+
+    erase needs robot=; sensor=, epoch=, first= and last= (numbers of scans, both included) narrow
+    it: without them all scans of the robot go. Exit code 65: the service refuses, and says why.
     """
     try:
         selector = topics.cmd_key(map_id, name)
     except ProtocolError as error:
-        raise typer.BadParameter(str(error)) from error
+        raise typer.BadParameter(str(error), param_hint="name") from error
+    for parameter in parameters or ():
+        if "=" not in parameter:
+            raise typer.BadParameter(f"{parameter!r} is not key=value", param_hint="parameters")
     if parameters:
         selector += "?" + ";".join(parameters)
     with open_session(client_settings(connect, credentials=credentials)) as session:
         replies = list(session.get(selector, timeout=15.0))
-    if not replies:
-        raise InputError(f"no service maps {map_id!r} at {connect}")
+        if not replies:
+            raise InputError(no_service(session, map_id, connect))
     for reply in replies:
         if reply.ok is None:
             assert reply.err is not None
-            err.print(reply.err.payload.to_string())
-            raise typer.Exit(Exit.FAULT)
+            raise InputError(reply.err.payload.to_string())
         for key, value in json.loads(reply.ok.payload.to_string()).items():
             out.print(f"{key}: {value}")
 
