@@ -11,7 +11,7 @@ from rerun.chunk import RrdReader
 
 import office
 from facet.sinks import drawing
-from facet.sinks.dashboard import PATH_PIECE, Dashboard, RobotPath, RrdViewer
+from facet.sinks.dashboard import PATH_PIECE, Dashboard, RobotPath, RrdViewer, _leaves
 from facet_protocol.messages import (
     Envelope,
     Event,
@@ -190,3 +190,17 @@ def test_the_view_follows_the_map_outwards(monkeypatch):
     for update in office.growth():
         dashboard.write_update(update)
     assert 2 <= len(sent) <= 4
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        ((0.0, 0.0, 0.0), (4.0, 30.0, 3.0), False),
+        ((-2.0, 0.0, 0.0), (4.0, 32.0, 3.0), False),  # within the margin
+        ((0.0, 0.0, 0.0), (8.0, 30.0, 3.0), True),  # across a long map: hardly larger in all
+        ((0.0, -4.0, 0.0), (4.0, 30.0, 3.0), True),
+    ],
+)
+def test_what_grows_out_of_the_view_is_seen_at_once(low, high, expected):
+    fitted = np.array([(0.0, 0.0, 0.0), (4.0, 30.0, 3.0)])
+    assert _leaves(np.array([low, high]), fitted) is expected

@@ -34,6 +34,7 @@ POSE_TOPICS = pose_topic("_").removesuffix("_")
 NS = 1_000_000_000  # of stamps
 PLANES_EVERY_S, POINTS_EVERY_S = 0.25, 1.0  # live
 FILE_PLANES_EVERY_S, FILE_POINTS_EVERY_S = 0.5, 3.0  # a file keeps all of it
+MARGIN = 0.1  # of the fitted model's size: what grows farther leaves the view
 PATH_STEP_M = 0.05  # a robot that stands still grows no path
 PATH_PIECE = 64  # positions an entity: the piece under way is drawn again, the others are done
 
@@ -77,7 +78,7 @@ class Dashboard:
         self._robots: dict[str, RobotPath] = {}
         self._series: set[str] = set()
         self._health = "OK"
-        self._extent = 0.0
+        self._fitted: NDArray[np.float64] | None = None  # (2, 3) m: the box that the view shows
         stream.log("/", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         stream.send_blueprint(layout.blueprint(()))
 
@@ -194,10 +195,12 @@ class Dashboard:
 
     def _fit_view(self) -> None:
         """Step back when the map has outgrown the view; otherwise leave the eye to the user."""
-        p = corners(self._planes.values())
-        extent = float(np.linalg.norm(np.ptp(p, axis=0))) if len(p) else 0.0
-        if extent > 1.3 * self._extent:
-            self._extent = extent
+        p = corners(plane for plane in self._planes.values() if not is_overhead(plane))
+        if len(p) == 0:
+            return
+        box = np.stack([p.min(axis=0), p.max(axis=0)])
+        if self._fitted is None or _leaves(box, self._fitted):
+            self._fitted = box
             self._stream.send_blueprint(layout.blueprint([*self._planes.values()]))
 
     def fit_view_finally(self) -> None:
@@ -227,6 +230,12 @@ class Dashboard:
         if num_updated:
             text = f"{num_updated} planes updated, revision {update.revision}"
             self._stream.log("events", rr.TextLog(text, level=rr.TextLogLevel.DEBUG))
+
+
+def _leaves(box: NDArray[np.float64], fitted: NDArray[np.float64]) -> bool:
+    """Whether a box (2, 3) sticks out of another by more than the view has room for."""
+    room = MARGIN * float(np.linalg.norm(fitted[1] - fitted[0]))
+    return bool((box[0] < fitted[0] - room).any() or (box[1] > fitted[1] + room).any())
 
 
 def _entity(plane: Plane) -> str:

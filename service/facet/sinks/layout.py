@@ -11,7 +11,13 @@ from facet_protocol.messages import Plane
 
 TIMELINE = "stamp"
 OVERHEAD = "overhead"  # entities of this name are left out of the first view
-FAR = 0.92  # of the model's width in the view: the eye's distance
+GAUGES = {  # what is drawn together has one unit; `facet top` shows them all
+    "Waiting, messages": ("in_flight", "queue_msgs", "waiting_for_pose", "waiting_for_points"),
+    "Memory, MB": ("rss_mb",),
+    "Voxels": ("voxels",),
+}
+LEGEND = rrb.Corner2D.LeftTop  # curves begin low and grow
+FAR = 1.05  # of the model's width in the view: the eye's distance
 
 
 def blueprint(planes: Sequence[Plane], has_service: bool = True) -> rrb.Blueprint:
@@ -20,11 +26,10 @@ def blueprint(planes: Sequence[Plane], has_service: bool = True) -> rrb.Blueprin
     `has_service` False leaves out what only a running service tells: its stage times and gauges.
     """
     events = rrb.TextLogView(name="Events", origin="/events", columns=_event_columns())
-    area = rrb.TimeSeriesView(name="Surfaces by class, m²", origin="/area")
-    stages = rrb.TimeSeriesView(name="Stage times, ms", origin="/stages")
-    gauges = rrb.TimeSeriesView(name="Service", origin="/gauges")
+    area = rrb.TimeSeriesView(name="Surfaces by class, m²", origin="/area", plot_legend=LEGEND)
+    stages = rrb.TimeSeriesView(name="Stage times, ms", origin="/stages", plot_legend=LEGEND)
     if has_service:
-        side = rrb.Vertical(stages, area, rrb.Tabs(events, gauges, active_tab=0))
+        side = rrb.Vertical(stages, area, rrb.Tabs(events, *_gauges(), active_tab=0))
     else:
         side = rrb.Vertical(area, events)
     return rrb.Blueprint(
@@ -47,6 +52,18 @@ def _model(planes: Sequence[Plane]) -> rrb.Spatial3DView:
         background=rrb.Background(color=(24, 27, 33)),
         line_grid=rrb.LineGrid3D(visible=False),
     )
+
+
+def _gauges() -> list[rrb.TimeSeriesView]:
+    return [
+        rrb.TimeSeriesView(
+            name=title,
+            origin="/gauges",
+            contents=[f"+ $origin/{name}" for name in names],
+            plot_legend=LEGEND,
+        )
+        for title, names in GAUGES.items()
+    ]
 
 
 def _whole() -> rrb.Spatial3DView:
