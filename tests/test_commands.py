@@ -24,6 +24,7 @@ from facet.commands.demo import _is_alive
 from facet.commands.imports import _nanoseconds, _read_npz, _read_poses
 from facet.commands.terminal import InputError
 from facet.session import client_settings, open_session
+from facet.sinks.layout import GAUGES
 from facet.sinks.log_file import write_recording
 from facet.sources.recording import Recording
 from facet_protocol.codec import decode
@@ -357,6 +358,8 @@ def test_run_play_stop_replay(log: Path, tmp_path: Path) -> None:
         status = process("status", "--connect", service.endpoint)
         assert status.returncode == 0, status.stderr
         assert "[r1/lidar]" in status.stdout
+        drawn = {name for names in GAUGES.values() for name in names}
+        assert {name for name in drawn if f"│ {name} " not in status.stdout} == set()
         said = " ".join(status.stdout.split())
         law = re.search(r"received (\d+) = applied (\d+) \+ .* \+ in flight (\d+)", said)
         assert law is not None
