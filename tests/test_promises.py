@@ -36,7 +36,9 @@ PROMISES: dict[str, str] = {
     "F18": "faults::f18_a_duplicate_is_applied_once "
     "faults::f18_of_two_scans_with_one_number_the_smaller_hash_wins "
     "faults_live::f18_conflicts_live_and_replayed rivals::whatever_comes_first "
-    "rivals::beyond_the_horizon_the_first_stays_and_it_is_counted",
+    "rivals::beyond_the_horizon_the_first_stays_and_it_is_counted "
+    "rivals::for_old_rivals_the_log_is_read_now_and_then_only "
+    "rivals::old_rivals_live_resumed_and_replayed",
     "F19": "faults_live::f19_gaps_and_late_arrivals sequences::*",
     "F20": "faults_live::f20_a_publisher_that_begins_anew",
     "F21": "faults_live::f21_two_publishers_under_one_name "

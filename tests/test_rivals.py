@@ -4,6 +4,7 @@ first, live as in the replay, after corrections and across a resume."""
 from __future__ import annotations
 
 import hashlib
+import random
 from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
@@ -229,6 +230,65 @@ def test_beyond_the_horizon_the_first_stays_and_it_is_counted(
     assert again.mapper.digest().state == expected.state
 
 
+@pytest.fixture
+def short_window(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All numbers are old as soon as another scan has come, for whoever is made from now on."""
+    monkeypatch.setitem(Rivals.__init__.__kwdefaults__, "window_bytes", 1)
+    monkeypatch.setattr(rivals, "FAR_EVERY", 3)
+
+
+@pytest.mark.usefixtures("short_window")
+def test_for_old_rivals_the_log_is_read_now_and_then_only(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """It takes the mapper long: one robot's old numbers, sent again with other bytes, would stop it
+    for all. Copies of what came first are not asked about."""
+    line = CorrectedLine(tmp_path)
+    reads: list[Number] = []
+    read = line.admission.past.read
+    line.admission.past.read = lambda wanted: reads.extend(wanted) or read(wanted)  # type: ignore[method-assign, func-returns-value]
+    pairs = {k: rival_pair(k) for k in (1, 2, 3)}
+    put(line, *(worst for _, worst in pairs.values()))
+    for k, (best, worst) in pairs.items():
+        put(line, best, worst)
+        assert [number.sequence for number in reads] == [1], k
+    put(line, *(replace(small(k), robot="r2") for k in range(1, 8)))  # another's change nothing
+    put(line, pairs[2][0])
+    assert account_of(line)[f"late_duplicate[{SOURCE}]"] == 3
+    put(line, *(small(k) for k in (4, 5, 6)), pairs[2][0])
+    assert [number.sequence for number in reads] == [1, 2]
+    others = [replace(small(k), robot="r2") for k in range(1, 8)]
+    kept = [pairs[1][0], pairs[2][0], pairs[3][1], *(small(k) for k in (4, 5, 6)), *others]
+    assert line.mapper.digest() == digest_of(kept)
+    assert len([m for m in caplog.messages if f"{SOURCE}: late_duplicate: " in m]) == 1
+    line.recorder.close()
+    assert told(replay_log([tmp_path], Config()).mapper) == told(line.mapper)
+
+
+@pytest.mark.usefixtures("short_window")
+@pytest.mark.parametrize("seed", range(6))
+def test_old_rivals_live_resumed_and_replayed(tmp_path: Path, seed: int) -> None:
+    """Which of them are late is told by the log: the same after a kill, and in the replay."""
+    draw = random.Random(seed)
+    line, num_late, waiting = CorrectedLine(tmp_path), 0, list[Envelope]()
+    for number in range(1, 40):
+        scan = other(draw.randint(1, 1 + number // 2), draw.randint(1, 3))
+        waiting.append(scan_envelope(scan))
+        if draw.random() < 0.5:
+            line.scans(*waiting)
+            waiting.clear()
+        if draw.random() < 0.1:
+            num_late += account_of(line)["late_duplicate"]
+            line.checkpoint()
+            line.recorder.commit()
+            line = CorrectedLine(tmp_path, resume(config(tmp_path), Mapper(SETTINGS)))
+    put(line, small(90))
+    assert num_late + account_of(line)["late_duplicate"] > 0
+    line.recorder.close()
+    replayed = replay_log([tmp_path], Config())
+    assert told(replayed.mapper) == told(line.mapper)
+
+
 def test_without_room_to_remember_it_the_first_stays(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -274,7 +334,7 @@ def test_recent_is_a_ring(monkeypatch: pytest.MonkeyPatch) -> None:
     assert recent.find(1, 999) is None
     columns = recent.columns()
     assert columns[0][:, 1].tolist() == list(range(1000 - rivals.HORIZON, 1000))
-    again = Recent.of(*columns)
+    again = Recent.of(columns)
     for one in (recent, again):
         one.add(1, 1000, bytes(32))
         assert one.find(*(int(n) for n in columns[0][0])) is None

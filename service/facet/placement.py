@@ -157,5 +157,6 @@ class Placement:
         self.account.settle(source, verdict)
         if verdict is Verdict.LATE:
             text = f"number {envelope.sequence} of epoch {envelope.epoch} came again after more "
-            text += f"than {HORIZON} others: the first stays, whatever this one is"
+            text += f"than {HORIZON} others, or soon after another that came as late: "
+            text += "the first stays, whatever this one is"
             self.account.complain(source, verdict, text)

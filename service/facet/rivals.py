@@ -6,7 +6,7 @@ from __future__ import annotations
 import hashlib
 import json
 from collections import OrderedDict
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from enum import StrEnum
 from typing import Any, NamedTuple
@@ -19,11 +19,13 @@ from facet.past import Number, Past
 from facet.sequences import Numbers
 from facet_protocol.messages import Envelope, ProtocolError
 
-HORIZON = 8192  # scans of a source whose hashes are known: 200 s at 40 Hz, 49 bytes each
+HORIZON = 8192  # scans of a source whose hashes are known: 200 s at 40 Hz, 65 bytes each
 MAX_SOURCES = 256  # whose scans are remembered: the one unheard for longest is forgotten
 WINDOW_BYTES = 16 << 20  # of the newest scans of all, as they came; an older one is in the log
+FAR_EVERY = 256  # scans of a source for each older rival of its own that the log is read for
 MAX_CHOSEN = 1 << 16  # numbers of which a later scan is in the map
 HASH_BYTES = 32
+COLUMNS = ("numbers", "digests", "placed", "firsts", "met_at")  # of Recent
 
 
 class Claim(NamedTuple):
@@ -31,6 +33,7 @@ class Claim(NamedTuple):
 
     number: Number
     digest: bytes  # SHA-256 of its payload
+    num_bytes: int = 0  # of its payload
 
 
 class Verdict(StrEnum):
@@ -38,7 +41,8 @@ class Verdict(StrEnum):
 
     FIRST = "applied"  # none of its number is in the map
     DUPLICATE = "duplicate"  # it is in the map
-    LATE = "late_duplicate"  # the horizon was passed since: the first stays, unseen
+    LATE = "late_duplicate"  # the horizon was passed since, or it is one too many of old numbers:
+    # the first stays, unseen
     LOSES = "conflict"  # the other has the smaller hash
     WINS = "replaced"  # the other has to go
 
@@ -51,14 +55,18 @@ class Recent:
         self.numbers = _taken((HORIZON, 2), np.uint64)  # epoch, sequence
         self.digests = _taken((HORIZON, HASH_BYTES), np.uint8)
         self.is_placed = _taken((HORIZON,), np.bool_)  # in the map; else it waits, or was refused
+        self.firsts = _taken((HORIZON,), np.uint64)  # of the hash of the first with the number
+        self.met_at = _taken((HORIZON,), np.int64)  # bytes that had come then
         self.num = 0  # that ever came
+        self.asked_at = -FAR_EVERY  # `num` when the log was last to be read for an old rival
         self._last: tuple[int, int] | None = None
 
-    def add(self, epoch: int, sequence: int, digest: bytes) -> None:
+    def add(self, epoch: int, sequence: int, digest: bytes, met_at: int = 0) -> None:
         row = self.num % HORIZON
         self.numbers[row] = epoch, sequence
         self.digests[row] = np.frombuffer(digest, np.uint8)
         self.is_placed[row] = False
+        self.firsts[row], self.met_at[row] = _prefix(digest), met_at
         self.num += 1
         self._last = epoch, sequence
 
@@ -71,22 +79,31 @@ class Recent:
         rows = np.flatnonzero(same[:, 1] & same[:, 0])
         return int(rows[0]) if len(rows) else None
 
-    def columns(self) -> tuple[NDArray[np.uint64], NDArray[np.uint8], NDArray[np.bool_]]:
-        """(N, 2) numbers, (N, 32) hashes, (N,) whether placed; oldest first."""
+    def may_ask(self) -> bool:
+        """Whether the log may be read for a rival of an old number; it will be."""
+        if self.num - self.asked_at < FAR_EVERY:
+            return False
+        self.asked_at = self.num
+        return True
+
+    def columns(self) -> tuple[NDArray[Any], ...]:
+        """(N, 2) numbers, (N, 32) hashes, (N,) whether placed, what their firsts were, and when;
+        oldest first."""
         order = np.arange(max(0, self.num - HORIZON), self.num) % HORIZON
-        return self.numbers[order], self.digests[order], self.is_placed[order]
+        return tuple(column[order] for column in self._columns())
 
     @staticmethod
-    def of(
-        numbers: NDArray[np.uint64], digests: NDArray[np.uint8], is_placed: NDArray[np.bool_]
-    ) -> Recent:
+    def of(columns: Iterable[NDArray[Any]], since_asked: int = FAR_EVERY) -> Recent:
         """What `columns` gave. Raises ValueError for more."""
         recent = Recent()
-        recent.num = len(numbers)
-        recent.numbers[: recent.num] = numbers
-        recent.digests[: recent.num] = digests
-        recent.is_placed[: recent.num] = is_placed
+        for own, column in zip(recent._columns(), columns, strict=True):
+            own[: len(column)] = column
+            recent.num = len(column)
+        recent.asked_at = recent.num - since_asked
         return recent
+
+    def _columns(self) -> tuple[NDArray[Any], ...]:
+        return self.numbers, self.digests, self.is_placed, self.firsts, self.met_at
 
 
 def _taken(shape: tuple[int, ...], dtype: type[np.generic]) -> NDArray[Any]:
@@ -108,6 +125,7 @@ class Rivals:
         self._recent: OrderedDict[str, Recent] = OrderedDict()  # the last heard of is the last
         self._window: OrderedDict[Number, Envelope] = OrderedDict()
         self._num_bytes = 0
+        self._met_bytes = 0  # of all scans that ever came
         self._hashed, self._digest = Envelope("", "", "", b""), b""
         self._chosen: dict[Number, bytes] = {}
         self._refused: dict[tuple[str, int], Numbers] = {}
@@ -120,14 +138,16 @@ class Rivals:
             return None
         if envelope is not self._hashed:  # most are asked about twice in a row
             self._hashed, self._digest = envelope, _digest(envelope)
-        return Claim(Number(source, envelope.epoch, envelope.sequence), self._digest)
+        number = Number(source, envelope.epoch, envelope.sequence)
+        return Claim(number, self._digest, len(envelope.payload))
 
     def meet(self, claim: Claim, *, is_first: bool) -> Verdict:
         """It has come; `is_first`: none with its number had. FIRST and WINS go on to `judge`."""
-        number, digest = claim
+        number, digest, num_bytes = claim
+        self._met_bytes += num_bytes
         if not is_first:
             row = self._row(number)
-            if row is None:
+            if row is None or self._is_one_too_many(self._recent[number.source], row, digest):
                 return Verdict.LATE
             is_same = self._recent[number.source].digests[row].tobytes() == digest
             return Verdict.DUPLICATE if is_same else Verdict.WINS
@@ -136,7 +156,7 @@ class Rivals:
 
     def judge(self, claim: Claim) -> Verdict:
         """It could be in the map now: whether it is to be."""
-        number, digest = claim
+        number, digest, _ = claim
         row = self._row(number)
         if row is None:
             return Verdict.LATE
@@ -158,7 +178,7 @@ class Rivals:
     def place(self, claim: Claim, envelope: Envelope) -> None:
         """It is in the map now, and no other of its number. Raises ProtocolError, changing
         nothing, when there is no room to remember it."""
-        number, digest = claim
+        number, digest, _ = claim
         row, recent = self._row(number), self._recent[number.source]
         assert row is not None
         if recent.digests[row].tobytes() != digest or self._is_refused(number):
@@ -203,40 +223,51 @@ class Rivals:
     def freeze(self) -> dict[str, NDArray[Any]]:
         """All but the window, which the log holds."""
         columns = [recent.columns() for recent in self._recent.values()]
-        names = [[s, len(c[0])] for s, c in zip(self._recent, columns, strict=True)]
+        names = [
+            [source, len(own[0]), min(FAR_EVERY, recent.num - recent.asked_at)]
+            for (source, recent), own in zip(self._recent.items(), columns, strict=True)
+        ]
         text = {
+            "met_bytes": self._met_bytes,
             "sources": names,
             "chosen": [[*number, digest.hex()] for number, digest in self._chosen.items()],
             "refused": [[*name, n.starts, n.ends] for name, n in self._refused.items()],
         }
-        none = (np.zeros((0, 2), np.uint64), np.zeros((0, HASH_BYTES), np.uint8))
-        numbers, digests, is_placed = (
-            np.concatenate(column)
-            for column in zip((*none, np.zeros(0, np.bool_)), *columns, strict=True)
-        )
+        none = tuple(c[:0] for c in Recent().columns())
+        whole = (np.concatenate(column) for column in zip(none, *columns, strict=True))
         return {
             "rivals": np.frombuffer(json.dumps(text).encode(), np.uint8),
-            "rival_numbers": numbers,
-            "rival_digests": digests,
-            "rival_placed": is_placed,
+            **{f"rival_{name}": column for name, column in zip(COLUMNS, whole, strict=True)},
         }
 
     def thaw(self, frozen: Mapping[str, NDArray[Any]]) -> None:
         """Know what was frozen. Raises KeyError, TypeError, ValueError for anything else."""
         text = json.loads(frozen["rivals"].tobytes())
-        columns = [frozen[f"rival_{name}"] for name in ("numbers", "digests", "placed")]
-        num = sum(n for _, n in text["sources"])
-        if [c.shape for c in columns] != [(num, 2), (num, HASH_BYTES), (num,)]:
+        columns = [frozen[f"rival_{name}"] for name in COLUMNS]
+        num = sum(n for _, n, _ in text["sources"])
+        if [c.shape for c in columns] != [(num, 2), (num, HASH_BYTES), (num,), (num,), (num,)]:
             raise ValueError(f"{num} scans in {[c.shape for c in columns]}")
         at = 0
-        for source, n in text["sources"]:
-            self._recent[str(source)] = Recent.of(*(c[at : at + n] for c in columns))
+        for source, n, since_asked in text["sources"]:
+            own = (c[at : at + n] for c in columns)
+            self._recent[str(source)] = Recent.of(own, int(since_asked))
             at += n
+        self._met_bytes = int(text["met_bytes"])
         for source, epoch, sequence, digest in text["chosen"]:
             self._chosen[Number(str(source), int(epoch), int(sequence))] = bytes.fromhex(digest)
         for source, epoch, starts, ends in text["refused"]:
             numbers = Numbers(list(map(int, starts)), list(map(int, ends)))
             self._refused[str(source), int(epoch)] = numbers
+
+    def _is_one_too_many(self, recent: Recent, row: int, digest: bytes) -> bool:
+        """Whether it differs from the first of its number, which came so long ago that the log is
+        to be read for it, and that was done just now: it takes the mapper a tenth of a second.
+
+        It is told by what has come, in the order of the log, and by nothing that became of it: what
+        waits for its pose is placed earlier live than in a replay."""
+        is_copy = recent.firsts[row] == _prefix(digest)
+        is_near = self._met_bytes - int(recent.met_at[row]) <= self._window_bytes
+        return not (is_copy or is_near or recent.may_ask())
 
     def _is_refused(self, number: Number) -> bool:
         return number.sequence in self._refused.get((number.source, number.epoch), ())
@@ -251,7 +282,7 @@ class Rivals:
                 self._recent.popitem(last=False)
             self._recent[number.source] = Recent()
         self._recent.move_to_end(number.source)
-        self._recent[number.source].add(number.epoch, number.sequence, digest)
+        self._recent[number.source].add(number.epoch, number.sequence, digest, self._met_bytes)
 
     def _choose(self, number: Number, digest: bytes) -> None:
         if number not in self._chosen and len(self._chosen) >= MAX_CHOSEN:
@@ -271,3 +302,7 @@ class Rivals:
 
 def _digest(envelope: Envelope) -> bytes:
     return hashlib.sha256(envelope.payload).digest()
+
+
+def _prefix(digest: bytes) -> np.uint64:
+    return np.uint64(int.from_bytes(digest[:8], "little"))
