@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import zenoh
@@ -19,6 +20,7 @@ from facet_protocol.topics import scan_key
 
 START_NS = 1_700_000_000_000_000_000
 PERIOD_NS = 100_000_000
+WAIT_S = 60.0  # for what takes no second, on a machine that is busy with other things
 
 
 def room_scan(sequence: int, robot: str = "r1", epoch: int = 5) -> Scan:
@@ -70,6 +72,11 @@ def free_endpoint() -> str:
         return f"tcp/127.0.0.1:{probe.getsockname()[1]}"
 
 
+def patient(settings: dict[str, Any]) -> dict[str, Any]:
+    """A client's that waits for the service, however busy the machine is."""
+    return settings | {"connect/timeout_ms": round(WAIT_S * 1e3)}
+
+
 @contextmanager
 def service_and_client() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
     """A service's session and a client's, on a free port of this machine; no shared memory."""
@@ -77,12 +84,19 @@ def service_and_client() -> Iterator[tuple[zenoh.Session, zenoh.Session]]:
     network = NetworkSection(listen=(endpoint,), shared_memory=False)
     with (
         open_session(service_settings(network)) as service,
-        open_session(client_settings(endpoint, shared_memory=False)) as client,
+        open_session(patient(client_settings(endpoint, shared_memory=False))) as client,
     ):
         yield service, client
 
 
-def wait_until(condition: Callable[[], object], timeout_s: float = 10.0) -> None:
+def wait_for_ear(client: zenoh.Session, key: str = scan_key("map", "r1", "lidar")) -> None:
+    """What is sent before the subscriber is known is lost."""
+    publisher = client.declare_publisher(key)
+    wait_until(lambda: publisher.matching_status.matching)
+    publisher.undeclare()
+
+
+def wait_until(condition: Callable[[], object], timeout_s: float = WAIT_S) -> None:
     """Return as soon as it holds; AssertionError when it does not in time."""
     deadline = time.monotonic() + timeout_s
     while not condition():

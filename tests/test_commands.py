@@ -30,7 +30,7 @@ from facet.sources.recording import Recording
 from facet_protocol.codec import decode
 from facet_protocol.messages import Scan
 from facet_protocol.topics import alive_key
-from rig import free_endpoint, room, wait_until
+from rig import WAIT_S, free_endpoint, room, wait_until
 
 COMMANDS = (
     *("run", "play", "status", "top", "cmd", "replay", "simulate"),
@@ -331,7 +331,7 @@ class Running:
             self.process = subprocess.Popen(
                 command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=os.environ.copy()
             )
-        wait_until(self.is_ready, 60)
+        wait_until(self.is_ready, 240)  # its loops may have to be compiled
 
     def is_ready(self) -> bool:
         assert self.process.poll() is None, (self.folder / "stderr.txt").read_text()
@@ -341,10 +341,10 @@ class Running:
         except zenoh.ZError:
             return False
 
-    def stop(self, number: int = signal.SIGTERM) -> tuple[int, str]:
-        """(exit code, standard output); it has five seconds."""
+    def stop(self, number: int = signal.SIGTERM, timeout_s: float = WAIT_S) -> tuple[int, str]:
+        """(exit code, standard output)."""
         self.process.send_signal(number)
-        output, _ = self.process.communicate(timeout=5)
+        output, _ = self.process.communicate(timeout=timeout_s)
         return self.process.returncode, output
 
 

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import zenoh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from typer.testing import CliRunner
@@ -30,7 +31,7 @@ from facet.sources.recording import Recording
 from facet_protocol import attachment, topics
 from facet_protocol.codec import decode, encode
 from facet_protocol.messages import Corrected, CorrectedPose, Correction, Envelope, Pose, Scan
-from rig import room_scan, scan_envelope, service_and_client, wait_until
+from rig import room_scan, scan_envelope, service_and_client, wait_for_ear, wait_until
 from test_resume import SETTINGS, Line, config, told
 
 KEY = topics.correction_key("map", "r1")
@@ -337,8 +338,11 @@ def test_live_over_zenoh_and_again_from_its_log(tmp_path: Path) -> None:
                 bytes(envelope.payload),
                 encoding=f"application/protobuf;{envelope.schema}",
                 attachment=attachment.pack(envelope.epoch, envelope.sequence, envelope.stamp_ns),
+                congestion_control=zenoh.CongestionControl.BLOCK,
             )
 
+        for envelope in (scan_envelope(shifted(1)), correction({1: pose(0.0)})):
+            wait_for_ear(client, envelope.key)
         for k in range(1, 7):
             put(scan_envelope(shifted(k)))
         wait_until(lambda: service.account["applied"] == 6, 60)

@@ -30,7 +30,7 @@ from facet_protocol.messages import (
 )
 from facet_protocol.mirror import MapMirror
 from facet_protocol.topics import alive_key, cmd_key, plane_key, snapshot_key
-from rig import service_and_client, wait_until
+from rig import WAIT_S, service_and_client, wait_until
 
 OUTGOING = Outgoing("map", "map", lambda: 1)
 
@@ -75,7 +75,7 @@ class Rig:
 
     def ask(self, selector: str) -> Any:
         replies = list(
-            self.client.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=5.0)
+            self.client.get(selector, consolidation=zenoh.ConsolidationMode.NONE, timeout=WAIT_S)
         )
         assert len(replies) == 1
         return replies[0]

@@ -24,7 +24,7 @@ from facet.sources.naming import is_scan
 from facet.sources.recording import Recording
 from facet_protocol import topics
 from facet_protocol.codec import decode
-from rig import room, service_and_client, wait_until
+from rig import WAIT_S, room, service_and_client, wait_until
 
 SETTINGS = MapSettings(voxel_m=0.1)
 
@@ -66,7 +66,7 @@ def break_disk(service: Service, monkeypatch: pytest.MonkeyPatch) -> threading.E
 
 
 def ask(client: zenoh.Session, selector: str) -> str:
-    (reply,) = client.get(selector, timeout=5.0)
+    (reply,) = client.get(selector, timeout=WAIT_S)
     if reply.ok is not None:
         return reply.ok.payload.to_string()
     assert reply.err is not None
@@ -122,7 +122,12 @@ def test_losses_and_duplicates_are_counted_and_logged(tmp_path: Path) -> None:
         send(robot, 3, 3)
         robot._sequences[key] -= 1  # the last one again
         send(robot, 3, 3)
-        client.put(key, b"nonsense", encoding="application/protobuf;foxglove.PointCloud")
+        client.put(
+            key,
+            b"nonsense",
+            encoding="application/protobuf;foxglove.PointCloud",
+            congestion_control=zenoh.CongestionControl.BLOCK,
+        )
         wait_until(lambda: service.account["rejected.malformed"] == 1, 60)
         service.stop()
     account = service.account

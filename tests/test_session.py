@@ -19,7 +19,7 @@ from facet.config import ConfigError, NetworkSection, load_config
 from facet.session import client_settings, open_session, read_access_control, service_settings
 from facet.sources.live import Inbox, LiveSource
 from facet_protocol.messages import Envelope
-from rig import free_endpoint, room, wait_until
+from rig import WAIT_S, free_endpoint, room, wait_until
 from tcp_proxy import Proxy
 
 KEY = "facet/v1/map/robot/{}/scan/lidar"
@@ -45,18 +45,21 @@ def door(site: Site, kind: str) -> Iterator[Inbox]:
 
 
 @contextmanager
-def client(endpoint: str, credentials: Path | None) -> Iterator[zenoh.Session]:
+def client(
+    endpoint: str, credentials: Path | None, timeout_s: float = WAIT_S
+) -> Iterator[zenoh.Session]:
     settings = client_settings(endpoint, shared_memory=False, credentials=credentials)
-    with open_session(settings | {"connect/timeout_ms": 1500}) as session:
+    with open_session(settings | {"connect/timeout_ms": round(timeout_s * 1e3)}) as session:
         yield session
 
 
 def speaks(session: zenoh.Session, *names: str) -> None:
     """A scan under each name, and one more under the first: after it, all have passed the door."""
     wait_until(lambda: is_heard(session, names[0]))
-    for name in names:
-        session.put(KEY.format(name), name.encode(), encoding=ENCODING)
-    session.put(KEY.format(names[0]), b"last", encoding=ENCODING)
+    said = [*((name, name.encode()) for name in names), (names[0], b"last")]
+    for name, word in said:
+        block = zenoh.CongestionControl.BLOCK
+        session.put(KEY.format(name), word, encoding=ENCODING, congestion_control=block)
 
 
 def is_heard(session: zenoh.Session, name: str) -> bool:
@@ -79,7 +82,8 @@ def last(seen: list[Envelope]) -> bool:
 
 
 def refused(endpoint: str, credentials: Path | None) -> None:
-    with pytest.raises(zenoh.ZError, match="Unable to connect"), client(endpoint, credentials):
+    error = pytest.raises(zenoh.ZError, match="Unable to connect")
+    with error, client(endpoint, credentials, timeout_s=1.5):
         pass
 
 
@@ -204,7 +208,7 @@ def test_a_reader_reads_and_cannot_command(site: Site) -> None:
         ):
             wait_until(lambda: list(desk.get("facet/v1/map/snapshot", timeout=1.0)))
             for command in ("cmd/pause", "cmd/erase?robot=r1"):
-                assert list(operator.get(f"facet/v1/map/{command}", timeout=1.0))
+                assert list(operator.get(f"facet/v1/map/{command}", timeout=WAIT_S))
                 assert not [r for r in desk.get(f"facet/v1/map/{command}", timeout=1.0) if r.ok]
         for answer in answers:
             answer.undeclare()

@@ -22,8 +22,7 @@ from facet.sinks.viewer import Follower
 from facet_protocol.codec import encode
 from facet_protocol.messages import Envelope, MapUpdate, Status, TilePoints
 from facet_protocol.topics import update_key
-
-WAIT_S = 15.0
+from rig import WAIT_S
 
 
 class FakeScreen:
@@ -177,6 +176,16 @@ def test_an_unknown_target_is_refused(target):
 
 
 def test_the_web_dashboard_listens_on_loopback_only_and_ends_when_it_hangs(port):
+    _ends_when_it_hangs(port)
+
+
+@pytest.mark.slow
+def test_a_dashboard_that_hangs_ends_within_two_seconds(port):
+    assert _ends_when_it_hangs(port) < 2.0
+
+
+def _ends_when_it_hangs(port: int) -> float:
+    """How many seconds that takes."""
     with _service(port) as service:
         for update in office.growth():
             _publish(service, update)
@@ -194,9 +203,10 @@ def test_the_web_dashboard_listens_on_loopback_only_and_ends_when_it_hangs(port)
         finally:
             started = time.monotonic()
             process.terminate()
-            process.wait(5.0)
-        assert time.monotonic() - started < 2.0
+            process.wait(WAIT_S)
+            ended_s = time.monotonic() - started
         _wait(lambda: not rerun.is_running() or rerun.status() == psutil.STATUS_ZOMBIE)
+    return ended_s
 
 
 def _listening(process: psutil.Process) -> set[tuple[str, int]]:
