@@ -22,7 +22,9 @@ from facet import __version__
 from facet.__main__ import _said, app
 from facet.commands.demo import _is_alive
 from facet.commands.imports import _nanoseconds, _read_npz, _read_poses
+from facet.commands.replay import replay_log
 from facet.commands.terminal import InputError
+from facet.config import Config
 from facet.session import client_settings, open_session
 from facet.sinks.layout import GAUGES
 from facet.sinks.log_file import write_recording
@@ -128,6 +130,29 @@ def test_what_is_left_out_is_counted(log: Path) -> None:
     del scans[3]
     write_recording(log, scans, {})
     assert "missing from the log 1" in facet("replay", log, "--voxel", 0.1, code=3)
+
+
+def test_two_maps_in_one_folder_are_not_made_one(log: Path, tmp_path: Path) -> None:
+    write_recording(tmp_path / "hall.mcap", room(2), {"map": "hall", "frame": "map"})
+    with pytest.raises(InputError, match=r"logs of 2 maps, hall, room: name the files of one"):
+        replay_log([tmp_path], Config())
+    assert replay_log([log], Config()).num_scans == 6
+
+
+def test_millimetres_are_noticed(log: Path, tmp_path: Path) -> None:
+    assert "metres" not in facet("replay", log, "--voxel", 0.1)
+    scans = scans_of(log)
+    np.savez(
+        tmp_path / "mm.npz",
+        stamp_ns=np.array([scan.stamp_ns for scan in scans]),
+        T_world_sensor=np.stack([np.eye(4)] * len(scans)),
+        points=1000.0 * np.concatenate([scan.points for scan in scans]),
+        lengths=np.array([len(scan.points) for scan in scans]),
+    )
+    facet("import", tmp_path / "mm.npz", tmp_path / "mm.mcap")
+    text = facet("replay", tmp_path / "mm.mcap", "--voxel", 0.1)
+    assert "most points were left out" in text
+    assert "are they in metres?" in text
 
 
 def test_info(log: Path, tmp_path: Path) -> None:
@@ -285,6 +310,7 @@ def test_stamps_are_exact() -> None:
         (("run", "--listen", "127.0.0.1:7447"), 78, "PROTOCOL/HOST:PORT"),
         (("run", "--record", __file__), 65, "the log needs a folder"),
         (("status", "--connect", "tcp/127.0.0.1:9"), 74, "nobody answers at tcp/127.0.0.1:9"),
+        (("status", "--connect", "127.0.0.1:9"), 74, "PROTOCOL/HOST:PORT"),
         (("cmd", "export", "glb"), 2, "'glb' is not key=value"),
         (("simulate", "x.mcap", "--range-noise", "-1"), 2, "--range-noise"),
         (("simulate", "x.mcap", "--speed", "0"), 2, "--speed"),

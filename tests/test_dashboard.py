@@ -196,9 +196,9 @@ def test_the_view_follows_the_map_outwards(monkeypatch):
     ("low", "high", "expected"),
     [
         ((0.0, 0.0, 0.0), (4.0, 30.0, 3.0), False),
-        ((-2.0, 0.0, 0.0), (4.0, 32.0, 3.0), False),  # within the margin
+        ((-1.0, 0.0, 0.0), (4.0, 31.0, 3.0), False),  # within the margin
         ((0.0, 0.0, 0.0), (8.0, 30.0, 3.0), True),  # across a long map: hardly larger in all
-        ((0.0, -4.0, 0.0), (4.0, 30.0, 3.0), True),
+        ((0.0, -2.0, 0.0), (4.0, 30.0, 3.0), True),
     ],
 )
 def test_what_grows_out_of_the_view_is_seen_at_once(low, high, expected):

@@ -270,10 +270,14 @@ def test_a_spoiled_checkpoint_is_not_used(tmp_path: Path, how: str) -> None:
     assert told(resumed.mapper) == told(line.mapper)
 
 
-def test_other_settings_are_applied_to_all_of_the_log(tmp_path: Path) -> None:
+@pytest.mark.parametrize("other", [{"theta_deg": 10.0}, {"voxel_m": 0.25}])
+def test_other_settings_are_applied_to_all_of_the_log(
+    tmp_path: Path, other: dict[str, float], caplog: pytest.LogCaptureFixture
+) -> None:
     two_checkpoints(tmp_path)
-    settings = replace(SETTINGS, theta_deg=10.0)
+    settings = replace(SETTINGS, **other)
     resumed = resume(config(tmp_path), Mapper(settings))
+    assert caplog.text.count("with other settings") == 2
     assert resumed.checkpoint is None
     assert resumed.num_scans == 4
     assert resumed.mapper.settings == settings

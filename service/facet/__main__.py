@@ -22,6 +22,7 @@ from facet.commands.simulate import simulate
 from facet.commands.talk import cmd, status, top
 from facet.commands.terminal import Exit, InputError, err, out
 from facet.config import ConfigError
+from facet.session import DEFAULT_ENDPOINT
 from facet.sources.mcap_damage import LogError
 from facet_protocol.messages import ProtocolError
 
@@ -37,6 +38,7 @@ app = typer.Typer(
 # Zenoh's own words end with the line of its source; what they begin with tells what was tried
 _SOURCE = re.compile(r" at \S+\.rs:\d+\.?")
 _NOBODY = re.compile(r"Unable to connect to any of \[\w+\((.*?)\)\]")
+_NO_ENDPOINT = re.compile(r"Endpoints must be of the form \S+: ([^\s\"]+)")
 _TAKEN = re.compile(r"bound to (\S+): .*Address already in use")
 LIVE, FILES = (
     (run, play, status, top, cmd),
@@ -97,17 +99,20 @@ def _said(error: Exception) -> str:
 
 
 def _network_said(text: str) -> str:
+    text = _SOURCE.sub("", text)
     if nobody := _NOBODY.search(text):
         return (
             f"nobody answers at {nobody[1]}: `facet run` starts a service; "
             "--connect names another address"
         )
+    if wrong := _NO_ENDPOINT.search(text):
+        return f"{wrong[1]!r} is no endpoint: that is PROTOCOL/HOST:PORT, as in {DEFAULT_ENDPOINT}"
     if taken := _TAKEN.search(text):
         return (
             f"{taken[1]} is taken, by another service perhaps: --listen names another, "
             "as in --listen tcp/127.0.0.1:7448"
         )
-    return _SOURCE.sub("", text)
+    return text
 
 
 if __name__ == "__main__":

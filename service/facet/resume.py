@@ -143,11 +143,17 @@ def _sync(path: Path) -> None:
 
 
 def thaw_checkpoint(
-    path: Path, settings: MapSettings | None = None, memory: Memory | None = None
+    path: Path,
+    settings: MapSettings | None = None,
+    memory: Memory | None = None,
+    origin: str | None = None,
 ) -> tuple[Checkpoint, Mapper]:
-    """A checkpoint and its map. Raises CheckpointError, OSError."""
+    """A checkpoint and its map; of that `origin` alone, where one is given. Raises
+    CheckpointError, OSError."""
     checkpoint = read_checkpoint(path)
     header = checkpoint.header
+    if origin not in (None, header.get("origin")):
+        raise CheckpointError(path, "it was made by another version, or with other settings")
     try:
         settings = settings or MapSettings(**header["settings"])
         mapper = thaw(_part(checkpoint, MAP), settings, header["map"], memory)
@@ -203,10 +209,9 @@ def _from_nothing(config: Config, mapper: Mapper) -> Resumed:
 
 def _from_checkpoint(path: Path, config: Config, new: Mapper, files: Sequence[Path]) -> Resumed:
     """The map of a checkpoint. Raises CheckpointError unless it is of this log and settings."""
-    checkpoint, mapper = thaw_checkpoint(path, new.settings, new.memory)
+    wanted = origin(new.settings, config)
+    checkpoint, mapper = thaw_checkpoint(path, new.settings, new.memory, wanted)
     header = checkpoint.header
-    if header["origin"] != origin(new.settings, config):
-        raise CheckpointError(path, "it was made by another version, or with other settings")
     resumed = _from_nothing(config, mapper)
     try:
         _check_files(header["log"], files)

@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from facet.mapping.mapper import Mapper
 
 POINTS_EVERY_NS = 500_000_000
+MOST = 0.5  # of the points: a wrong unit leaves out about all
 
 
 @dataclass(slots=True)
@@ -92,7 +93,8 @@ def replay_log(
     on_scan: Callable[[int], None] = lambda num: None,
 ) -> Replayed:
     """Rebuild a map from logs. `sinks` see what those of a running service see."""
-    head = Recording(existing(logs)).head()
+    _require_one_map(existing(logs))
+    head = Recording(logs).head()
     config = _as_recorded(config, head)
     past = Past(dialects_of(config.robots))
     recording = Recording(logs, dialects_of(config.robots), past.note_read)
@@ -126,6 +128,18 @@ def replay_log(
         sink.close()
     wall_s = time.monotonic() - started
     return Replayed(mapper, recording, account, wall_s, times.span_s, num, times.num_missing)
+
+
+def _require_one_map(logs: Sequence[Path]) -> None:
+    """Raises InputError for a folder with logs of more than one: what was two must not be one."""
+    for folder in filter(Path.is_dir, logs):
+        files = Recording([folder]).paths
+        maps = sorted({Recording([file]).head().get("map", "") for file in files} - {""})
+        if len(maps) > 1:
+            raise InputError(
+                f"{folder}: logs of {len(maps)} maps, {', '.join(maps)}: name the files of one, "
+                f"{folder / maps[0]}-*.mcap"
+            )
 
 
 class _LogTimes:
@@ -303,6 +317,14 @@ def print_result(result: Replayed, model: Model) -> None:
     if result.num_left_out:
         reasons = ", ".join(f"{num:,} {name}" for name, num in result.left_out.items())
         err.print(f"left out: {reasons}")
+    rejected = {
+        name.removeprefix("points_rejected."): num
+        for name, num in result.account.counters().items()
+        if name.startswith("points_rejected.") and "[" not in name
+    }
+    if sum(rejected.values()) > MOST * result.account["points_in"]:
+        reasons = ", ".join(f"{num:,} {name}" for name, num in rejected.items())
+        err.print(f"most points were left out: {reasons}; are they in metres?")
     if "no_pose" in result.left_out:
         err.print(
             "no_pose: no transforms lead from these scans to the map's frame; --frame names "

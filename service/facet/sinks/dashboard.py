@@ -34,7 +34,7 @@ POSE_TOPICS = pose_topic("_").removesuffix("_")
 NS = 1_000_000_000  # of stamps
 PLANES_EVERY_S, POINTS_EVERY_S = 0.25, 1.0  # live
 FILE_PLANES_EVERY_S, FILE_POINTS_EVERY_S = 0.5, 3.0  # a file keeps all of it
-MARGIN = 0.1  # of the fitted model's size: what grows farther leaves the view
+MARGIN = 0.05  # of the fitted model's size: what grows farther leaves the view
 PATH_STEP_M = 0.05  # a robot that stands still grows no path
 PATH_PIECE = 64  # positions an entity: the piece under way is drawn again, the others are done
 
