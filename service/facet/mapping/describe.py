@@ -175,11 +175,11 @@ def _centre(ring: NDArray[np.int32], frame: object) -> NDArray[np.float64]:
 
 
 def _key(own: Figures, contour: Contour) -> tuple[bytes, ...]:
-    seen = own.sighting
+    fit, seen = own.fit, own.sighting
     return (
-        own.fit.inside.tobytes(),
-        np.float64(own.fit.offset_m).tobytes(),
-        np.float64(own.fit.sigma_n_m).tobytes(),
+        fit.inside.tobytes(),
+        np.array([fit.offset_m, fit.sigma_n_m, fit.thickness_angle_deg]).tobytes(),
+        fit.covariance.tobytes(),
         own.centroid.tobytes(),
         repr(
             (own.num_points, own.num_voxels, contour.rounded, seen.first_ns, seen.last_ns)

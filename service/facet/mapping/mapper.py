@@ -178,17 +178,18 @@ class Mapper:
         self, ids: NDArray[np.int64], grouped: Grouped, done: Timer = lambda stage: None
     ) -> list[int]:
         """Figures and outlines of the planes, under their ids (K,). Returns those that changed."""
-        renamed = self._name(ids)
+        changed = {*grouped.changed, *self._name(ids)}
         figures = self._figures(ids, grouped.points)
         done("identity")
         self._contours.update(
-            self._store, self._tiles.tiles, {*grouped.changed, *renamed},
+            self._store, self._tiles.tiles, changed,
             {i: own.fit.inside for i, own in figures.items()},
         )  # fmt: skip
         done("contours")
         updated = self._describer.update(figures, self._contours.contours, self._free)
         done("describe")
-        self.changed_tiles = [unpack(key) for key in sorted({*grouped.changed, *renamed})]
+        shown = changed | self._tiles.renamed_abroad(self._store, changed)
+        self.changed_tiles = [unpack(key) for key in sorted(shown)]
         return updated
 
     def snapshot(self) -> MapUpdate:

@@ -129,6 +129,23 @@ def inherit(old, new, scratch, counts):  # type: ignore[no-untyped-def]
         scratch[rows[m]] = 0
 
 
+@kernel
+def list_abroad(blocks, block_of, tile_key, rows, corner, starts, ids, out):  # type: ignore[no-untyped-def]
+    """Members of a tile's tile-planes that lie in other tiles, with the plane ids (T,) that they go
+    by, as row << 32 | id. How many."""
+    ti, tj, tk = unpack(tile_key)
+    count = 0
+    for t in range(starts.shape[0] - 1):
+        for m in range(starts[t], starts[t + 1]):
+            if corner[m]:
+                continue
+            i, j, k = unpack(blocks.keys[block_of[rows[m]]])
+            if i >> 3 != ti or j >> 3 != tj or k >> 3 != tk:
+                out[count] = (np.int64(rows[m]) << 32) | ids[t]
+                count += 1
+    return count
+
+
 @kernel(parallel=True)
 def sum_points(  # type: ignore[no-untyped-def]
     rows, corner, starts, tile_keys, shares, blocks, columns, border, second, nodes, planes, points,

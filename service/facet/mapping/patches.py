@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from facet.mapping.bits import trailing_zeros
 from facet.mapping.blocks import CENTRE, row_at
-from facet.mapping.claims import label_blocks
+from facet.mapping.claims import find_dependents, label_blocks
 from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory
@@ -288,22 +288,6 @@ def _sum_all(blocks, columns, border, patches, which, rungs, histograms):  # typ
         _sum_some(blocks, columns, border, patches, which, start, stop, rungs, histograms[share])
 
 
-@kernel
-def _dilate(blocks, which, flags, out):  # type: ignore[no-untyped-def]
-    """Each of the blocks and of their 26 neighbours, once. Returns how many."""
-    count = 0
-    for q in range(which.shape[0]):
-        for n in range(27):
-            other = which[q] if n == CENTRE else blocks.neighbours[which[q], n]
-            if other >= 0 and not flags[other]:
-                flags[other] = True
-                out[count] = other
-                count += 1
-    for q in range(count):
-        flags[out[q]] = False
-    return count
-
-
 class PatchField:
     """Patches of all blocks, kept true by grouping dirty blocks again."""
 
@@ -363,10 +347,8 @@ class PatchField:
 
     def _around(self, store: VoxelStore, blocks: NDArray[np.int32]) -> NDArray[np.int32]:
         """Blocks whose labels depend on the patches of `blocks`."""
-        near, wide = (np.empty(store.num_blocks, np.int32) for _ in range(2))
-        near = near[: _dilate(store.blocks, blocks, self._flags, near)]
-        wide = wide[: _dilate(store.blocks, near, self._flags, wide)]
-        return np.union1d(near, wide[self.patches.far[wide]])
+        out = np.empty(store.num_blocks, np.int32)
+        return out[: find_dependents(store.blocks, self.patches.far, blocks, self._flags, out)]
 
     def sigma(self) -> float:
         """Noise of the scene, ticks: the median over member voxels of their patch's rung."""

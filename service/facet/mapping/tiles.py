@@ -20,6 +20,7 @@ from facet.mapping.membership import (
     collect_members,
     find_shells,
     inherit,
+    list_abroad,
     sum_points,
 )
 from facet.mapping.memory import Heap, Memory
@@ -58,6 +59,8 @@ class Tile:
     heritage: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 3), np.int64))
     # ids: (T,) at the last update; heritage: (plane id then, tile-plane now, voxels they share)
     named: bool = False  # the heritage is that of its ids
+    abroad: NDArray[np.int64] = field(default_factory=lambda: np.zeros(0, np.int64))
+    # abroad: voxels that lie in other tiles, as row << 32 | plane id, at the last update
 
     @property
     def num_planes(self) -> int:
@@ -164,6 +167,22 @@ class TileField:
             tile.heritage = np.stack([own, np.arange(len(own)), tile.occupation], axis=1)
         return renamed
 
+    def renamed_abroad(self, store: VoxelStore, keys: set[int]) -> set[int]:
+        """The tiles that hold voxels of these, whose voxels or plane ids changed, beyond them: as
+        far as they go by other ids now."""
+        lie_in = []
+        for key in sorted(keys):
+            tile = self.tiles[key]
+            out = np.empty(len(tile.rows), np.int64)
+            count = list_abroad(
+                store.blocks, store.columns.block, key, tile.rows, tile.corner, tile.starts,
+                tile.ids, out,
+            )  # fmt: skip
+            lie_in.append(np.setxor1d(out[:count], tile.abroad, assume_unique=True) >> 32)
+            tile.abroad = out[:count].copy()
+        rows = np.concatenate([np.zeros(0, np.int64), *lie_in])
+        return set(tile_keys_of(store.blocks.keys[store.columns.block[rows]]).tolist())
+
     def _admit(self, store: VoxelStore) -> None:
         """Give new blocks to their tiles."""
         count = store.num_blocks
@@ -253,6 +272,8 @@ class TileField:
         tile.heritage = np.stack([tile.ids[old], own, counts[old, own]], axis=1)
         tile.rows, tile.corner, tile.starts = new
         tile.named = False
+        if not tile.num_planes:
+            tile.ids = _NO_KEYS  # nobody will name it
         claims = starts_of(corner)
         tile.occupation = np.diff(starts - claims[starts])
 
