@@ -71,6 +71,16 @@ def test_every_command_explains_itself(command: str) -> None:
     assert f"  facet {command}" in text  # an example
 
 
+def test_the_readme_names_every_command_and_no_option_that_is_not_there() -> None:
+    text = (Path(__file__).parents[1] / "README.md").read_text("utf-8")
+    told = [words.split() for words in re.findall(r"`facet ([a-z][^`]*)`", text)]
+    assert {words[0] for words in told} == set(COMMANDS)
+    for command, *words in told:
+        options = {word.rstrip(",") for word in words if word.startswith("--")}
+        said = facet(command, "--help")
+        assert {option for option in options if f"{option} " not in said} == set(), command
+
+
 def test_version() -> None:
     assert facet("--version").strip() == f"facet {__version__}"
 
