@@ -272,7 +272,7 @@ class ContourField:
         windows = np.zeros((len(near), SIDE, SIDE), np.uint64)
         for window, (plane_id, place) in zip(windows, near, strict=True):
             self._fill(window, self.contours[plane_id], place)
-        wanted = np.array(list(near.values())).reshape(-1, CELLS, CELLS)
+        wanted = np.array(list(near.values()), np.bool_).reshape(-1, CELLS, CELLS)
         different = set()
         for (plane_id, place), cells, new in zip(
             near, wanted, boundary_edges(windows, wanted), strict=True
