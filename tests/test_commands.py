@@ -81,6 +81,11 @@ def test_the_readme_names_every_command_and_no_option_that_is_not_there() -> Non
         assert {option for option in options if f"{option} " not in said} == set(), command
 
 
+def test_no_summary_of_a_command_is_cut_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    assert "..." not in facet("--help").partition("Commands:")[2]
+
+
 def test_version() -> None:
     assert facet("--version").strip() == f"facet {__version__}"
 

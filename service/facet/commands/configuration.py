@@ -19,7 +19,7 @@ def config(
         Path | None, typer.Argument(metavar="FILE.toml", help="Settings; the defaults otherwise.")
     ] = None,
 ) -> None:
-    """Print all settings as TOML, each with its meaning, its unit and its bounds.
+    """Print all settings as TOML. Each with its meaning, its unit and its bounds.
 
     \b
     facet config > facet.toml        # to begin with; a file need only hold what differs

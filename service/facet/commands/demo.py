@@ -45,7 +45,7 @@ def demo(
     ),
     speed: Annotated[str, typer.Option(help="How fast it is played: N times, or max.")] = "20",
 ) -> None:
-    """Watch a robot map a building: no robot, no building and no network needed.
+    """Watch a robot map a building. No robot, no building and no network needed.
 
     \b
     facet demo

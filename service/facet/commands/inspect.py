@@ -114,7 +114,7 @@ def info(
         Path, typer.Argument(help="A log (.mcap), a folder of them, model.json or a checkpoint.")
     ],
 ) -> None:
-    """What is in a log, a model or a checkpoint, and what was lost.
+    """Tell what is in a log, and what was lost. A model or a checkpoint, too.
 
     \b
     facet info out/log
@@ -241,7 +241,7 @@ def digest(
         Path, typer.Argument(help="A log (.mcap), a folder of them, model.json or a checkpoint.")
     ],
 ) -> None:
-    """The two hashes of a map: of its state, and of what is derived from it.
+    """Print the two hashes of a map. One is of its state, one of what is derived from it.
 
     \b
     facet digest out/log                # replays it

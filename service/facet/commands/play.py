@@ -138,8 +138,10 @@ def play(
     credentials: CredentialsOption = None,
     shared_memory: Annotated[bool, typer.Option(help="Large scans by shared memory.")] = True,
 ) -> None:
-    """Publish a recording over Zenoh, as the robot would; of ROS 2 too, with its transforms.
-    Scans get new numbers, so corrections of poses, which name the old ones, are not sent.
+    """Publish a recording over Zenoh, as the robot would.
+
+    Recordings of ROS 2 too, with their transforms. Scans get new numbers, so corrections of poses,
+    which name the old ones, are not sent.
 
     \b
     facet run &                                    # somebody has to listen

@@ -17,7 +17,7 @@ def recover(
     damaged: Annotated[Path, typer.Argument(help="A log (.mcap) that is cut off or damaged.")],
     clean: Annotated[Path, typer.Argument(help="The file to write; it must not be there.")],
 ) -> None:
-    """Write a clean log of all that is whole in a damaged one.
+    """Save what is whole in a damaged log, as a clean one.
 
     \b
     facet recover out/log/map-20260101T120000Z-000001.mcap clean.mcap

@@ -232,7 +232,7 @@ def replay(
     theta: ThetaOption = None,
     detail_level: DetailOption = None,
 ) -> None:
-    """Rebuild the map from its log: the same scans give the same map, bit for bit.
+    """Rebuild the map from its log. The same scans give the same map, bit for bit.
 
     \b
     facet replay out/log --report                  # the map again, and how it came about

@@ -69,7 +69,7 @@ def status(
     connect: ConnectOption = DEFAULT_ENDPOINT,
     credentials: CredentialsOption = None,
 ) -> None:
-    """How a running service is: what it has counted, what it holds, what its stages take.
+    """Tell how a running service is. What it has counted, what it holds, what its stages take.
 
     \b
     facet status
@@ -91,7 +91,7 @@ def top(
     connect: ConnectOption = DEFAULT_ENDPOINT,
     credentials: CredentialsOption = None,
 ) -> None:
-    """Watch a running service: what `facet status` says, every second, until Ctrl-C.
+    """Watch a running service, until Ctrl-C. Every second what `facet status` says.
 
     \b
     facet top
