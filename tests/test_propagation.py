@@ -1,7 +1,7 @@
 """What a change reaches: after any update all that is derived is what would be derived at once.
 
 Work follows change, so each rule that says whom a change concerns may forget someone. Compared is
-not only what users see, but every stage."""
+not only what users see, but every stage, and with the limits of rare paths set low."""
 
 from __future__ import annotations
 
@@ -9,18 +9,30 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
+from facet.mapping import claims, normals, patches, pivot, runs, store
 from facet.mapping.blocks import pack_all
 from facet.mapping.frozen import freeze, thaw
 from facet.mapping.mapper import Mapper
 from facet.mapping.settings import TICKS, MapSettings
-from facet_protocol.messages import Plane, Scan
+from facet_protocol.maps import encode_update
+from facet_protocol.messages import Plane, Scan, ScanKind
+from facet_protocol.mirror import MapMirror
 from mapping_logs import cloud, mapped
 
 Points = NDArray[np.float64]
 VOXEL_M = 0.0625  # a power of two: metres of whole voxels and ticks are exact
 SETTINGS = MapSettings(voxel_m=VOXEL_M)
+RARE = (  # limits below which a path is not taken, and what they are set to
+    (store, "NOTED", 50),
+    (patches, "FEW", 1),
+    (claims, "FEW", 1),
+    (pivot, "FEW", 1),
+    (normals, "SHARES", 3),
+    (runs, "SHARES", 3),
+)
 
 
 def grid(*axes: Points | list[float]) -> Points:
@@ -189,3 +201,103 @@ def test_tiles_that_show_voxels_of_a_plane_beyond_theirs_are_told_when_it_goes()
     assert [stone.plane_id for stone in mapper.update().retired] == [1]  # too little, now
     assert [p.plane_ids.tolist() for p in mapper.points([(0, 1, 0)])] == [[0]]
     assert {(0, 0, 0), (0, 1, 0)} <= set(mapper.changed_tiles)
+
+
+def sheet(rng: np.random.Generator, low: int, high: int, wide: int, pitch: list[int]) -> Points:
+    """A piece of the sheet x = 0, from `low` to `high` along y: rows of points so far apart."""
+    along, up = np.arange(low, high, pitch[0]), np.arange(0, wide, pitch[1])
+    points = grid([0.4], along + 0.5, up + 0.5)
+    return np.repeat(points, rng.integers(1, 4), axis=0)
+
+
+def turned(points: Points, way: int) -> Points:
+    """Along other axes, and there not upright."""
+    if way == 3:  # slanted
+        return points @ np.array([[0.8, 0.6, 0.0], [-0.6, 0.8, 0.0], [0.0, 0.0, 1.0]])
+    return np.roll(points, way, axis=1)
+
+
+def pieces(rng: np.random.Generator) -> list[Scan]:
+    """Sheets over several tiles in pieces, thin or dense, with gaps, from either side; what meets
+    them at an angle; some points here and there."""
+    wide, pitch = int(rng.integers(3, 40)), [int(rng.integers(1, 9)), int(rng.integers(1, 9))]
+    corner = 64.0 * rng.integers(-2, 2, 3) + rng.choice([0.0, 0.0, 0.5, 60.0])
+    way, steps, scans = int(rng.integers(4)), list[tuple[int, int]](), list[Scan]()
+    for tile in range(3):
+        first, last = 64 * tile + rng.integers(0, 9), 64 * tile + rng.integers(48, 65)
+        middle = int(rng.integers(first, last))
+        ends = [(first, last)] if rng.random() < 0.5 else [(first, middle), (middle + 6, last)]
+        steps.extend((int(low), int(high)) for low, high in ends)
+    for low, high in steps:
+        points = sheet(rng, low, high, wide, pitch)
+        kind = rng.random()
+        if kind < 0.3:  # the same rows in a corner or on a step
+            points = np.concatenate([points, (points - [0, low, 0])[:, [1, 0, 2]] + [0, low, 0]])
+        elif kind < 0.4:
+            points = points + rng.normal(size=points.shape) * 0.2
+        side = 60.0 if rng.random() < 0.8 else -60.0
+        places = turned(np.concatenate([points, [[side, 60.0, 10.0]]]), way) + corner
+        some = places[rng.permutation(len(places) - 1)[:1500]]
+        scans.append(seen(some, tuple(places[-1]), len(scans) + 1))
+    stray = rng.integers(-20, 150, (3, 3)) * [0.02, 1.0, 0.2]
+    scans.append(seen(turned(stray, way) + corner, tuple(corner + 60.0), 10))
+    return [replace(s, kind=ScanKind.LINE) if rng.random() < 0.1 else s for s in scans]
+
+
+def shown(mapper: Mapper) -> dict[tuple[int, int, int], tuple[bytes, bytes]]:
+    told = (p for p in mapper.points() if len(p.plane_ids))
+    return {p.tile: (p.centroids.tobytes(), p.plane_ids.tobytes()) for p in told}
+
+
+def scans_come_and_go(seed: int) -> None:
+    """After every update a map is that of its scans, its messages fold to it, and it says which
+    tiles to show again; at the end it comes back from what was frozen."""
+    rng = np.random.default_rng(seed)
+    few = replace(SETTINGS, min_area_m2=0.1, min_surface_m2=0.02)
+    scans, there, mirror, mapper = pieces(rng), set[int](), MapMirror(), Mapper(few)
+    before = shown(mapper)
+    for number in (*rng.permutation(len(scans)), *rng.integers(0, len(scans), 4)):
+        (mapper.retract if number in there else mapper.insert)(scans[number])
+        there ^= {int(number)}
+        if rng.random() < 0.2:
+            continue
+        assert mirror.apply(mapper.update())
+        assert encode_update(mirror.snapshot()) == encode_update(mapper.snapshot())
+        check_same(mapper, mapped([scans[k] for k in sorted(there)], few))
+        after, told = shown(mapper), set(mapper.changed_tiles)
+        assert {t for t in before.keys() | after if after.get(t) != before.get(t)} <= told
+        before = after
+    mapper.update()
+    other = thaw(freeze(mapper), few, mapper.map_id)
+    assert encode_update(other.snapshot()) == encode_update(mapper.snapshot())
+    assert other.digest() == mapper.digest()
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_scans_that_come_and_go_leave_what_they_would_at_once(seed: int) -> None:
+    scans_come_and_go(seed)
+
+
+@pytest.mark.parametrize("seed", range(100, 108))
+def test_so_they_do_on_rare_paths(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    for module, name, limit in RARE:
+        monkeypatch.setattr(module, name, limit)
+    scans_come_and_go(seed)
+
+
+@pytest.mark.parametrize("noted", [0, store.NOTED])
+@pytest.mark.parametrize(("first", "last", "up"), [(66.5, 54.0, 8.0), (69.5, 51.0, 4.0)])
+def test_normals_that_turn_far_from_what_was_touched_are_summed_again(
+    noted: int, first: float, last: float, up: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thin wall goes on beyond a gap: in the next tile its border is none any more, no more."""
+    monkeypatch.setattr(store, "NOTED", noted)
+    rows = np.arange(4.5, 4.0 + 3.3 * up, up)
+    wall = seen(grid([10.4], np.arange(first, 120.0, 5.0), rows), (60.0, 60.0, 10.0))
+    more = seen(grid([10.4], np.arange(last - 0.5, 0.0, -5.0), rows), (60.0, 60.0, 10.0), 2)
+    mapper = mapped([wall], SETTINGS)
+    borders = mapper._normals.normals.border.sum()
+    mapper.insert(more)
+    mapper.update()
+    assert mapper._normals.normals.border[: mapper._store.num_rows].sum() != borders
+    check_same(mapper, mapped([wall, more], SETTINGS))
