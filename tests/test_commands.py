@@ -6,6 +6,7 @@ import json
 import os
 import re
 import signal
+import socket
 import subprocess
 import sys
 from dataclasses import replace
@@ -32,7 +33,7 @@ from facet.sources.recording import Recording
 from facet_protocol.codec import decode
 from facet_protocol.messages import Scan
 from facet_protocol.topics import alive_key
-from rig import WAIT_S, free_endpoint, room, wait_until
+from rig import WAIT_S, free_endpoint, patient, room, wait_until
 
 COMMANDS = (
     *("run", "play", "status", "top", "cmd", "replay", "simulate"),
@@ -372,15 +373,20 @@ class Running:
             self.process = subprocess.Popen(
                 command, stdout=subprocess.PIPE, stderr=stderr, text=True, env=os.environ.copy()
             )
-        wait_until(self.is_ready, 240)  # its loops may have to be compiled
-
-    def is_ready(self) -> bool:
-        assert self.process.poll() is None, (self.folder / "stderr.txt").read_text()
         try:
-            with open_session(client_settings(self.endpoint, shared_memory=False)) as session:
-                return bool(list(session.liveliness().get(alive_key("map"))))
-        except zenoh.ZError:
-            return False
+            wait_until(self._listens, 240)  # its loops may have to be compiled
+            settings = patient(client_settings(self.endpoint, shared_memory=False))
+            with open_session(settings) as session:
+                wait_until(lambda: list(session.liveliness().get(alive_key("map"))))
+        except BaseException:
+            self.process.kill()
+            self.process.wait()
+            raise
+
+    def _listens(self) -> bool:
+        assert self.process.poll() is None, (self.folder / "stderr.txt").read_text()
+        with socket.socket() as probe:
+            return not probe.connect_ex(("127.0.0.1", int(self.endpoint.rpartition(":")[2])))
 
     def stop(self, number: int = signal.SIGTERM, timeout_s: float = WAIT_S) -> tuple[int, str]:
         """(exit code, standard output)."""

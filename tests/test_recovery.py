@@ -14,7 +14,7 @@ from facet.config import NetworkSection
 from facet.session import client_settings, open_session, service_settings
 from facet.sources.live import Inbox, LiveSource
 from facet.sources.recovery import GIVE_UP_S, MAX_ASKED, MAX_GAPS, MAX_MISSING, Recovery
-from rig import free_endpoint, room, wait_until
+from rig import free_endpoint, patient, room, wait_until
 from tcp_proxy import Proxy
 
 KEY = "facet/v1/map/robot/r1/scan/front"
@@ -162,7 +162,8 @@ def test_a_link_that_breaks_over_the_answer_costs_nothing() -> None:
             numbers.extend(e.sequence for e in inbox.take(1 << 30))
             return set(numbers)
 
-        with open_session(client_settings(proxy.endpoint, shared_memory=False)) as robot:
+        settings = patient(client_settings(proxy.endpoint, shared_memory=False))
+        with open_session(settings) as robot:
             publisher = RobotPublisher(robot, "map")
             publisher.publish("r1", "front", SCAN)
             wait_until(lambda: taken() == {1})

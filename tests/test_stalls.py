@@ -22,7 +22,7 @@ from facet_protocol import attachment, topics
 from facet_protocol.codec import decode
 from facet_protocol.messages import Envelope, Loss, Status
 from fault_rig import envelopes
-from rig import START_NS, room, wait_until
+from rig import START_NS, patient, room, wait_until
 from tcp_proxy import Proxy
 from test_commands import Running
 
@@ -55,7 +55,8 @@ class Sender:
         assert not self._thread.is_alive()
 
     def _run(self) -> None:
-        with open_session(client_settings(self._endpoint, shared_memory=False)) as session:
+        settings = patient(client_settings(self._endpoint, shared_memory=False))
+        with open_session(settings) as session:
             put = self._ours(session) if self._robot == "ours" else self._plain(session)
             due = time.monotonic()
             while not self._stop.is_set():
@@ -97,7 +98,7 @@ def watched(endpoint: str) -> Iterator[list[Status]]:
 
         seen.append(decode_status(sample.payload.to_bytes()))
 
-    with open_session(client_settings(endpoint, shared_memory=False)) as session:
+    with open_session(patient(client_settings(endpoint, shared_memory=False))) as session:
         subscriber = session.declare_subscriber(
             topics.status_key("map"), zenoh.handlers.Callback(hear, indirect=False)
         )
