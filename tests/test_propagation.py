@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from facet.mapping import claims, normals, patches, pivot, runs, store
+from facet.mapping import claims, normals, patches, pivot, runs, store, traces
 from facet.mapping.blocks import pack_all
 from facet.mapping.frozen import freeze, thaw
 from facet.mapping.mapper import Mapper
@@ -31,6 +31,8 @@ RARE = (  # limits below which a path is not taken, and what they are set to
     (claims, "FEW", 1),
     (pivot, "FEW", 1),
     (normals, "SHARES", 3),
+    (traces, "PLACES", 5),
+    (traces, "MOST_KEPT", 3),
     (runs, "SHARES", 3),
 )
 

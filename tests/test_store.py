@@ -140,12 +140,15 @@ def test_growing_loses_nothing() -> None:
 def test_settle_tells_what_changed_and_only_that() -> None:
     store = filled([ticks_of(0, 4000)])
     first = store.settle()
-    assert sorted(first.tolist()) == sorted(store.occupied_rows().tolist())
-    assert len(store.settle()) == 0
+    assert sorted(first.rows.tolist()) == sorted(store.occupied_rows().tolist())
+    assert not first.before.any()
+    assert len(store.settle().rows) == 0
     before = store.columns.observable.copy()
     store.insert(ticks_of(1, 300))
     touched = set(store.touched.rows.tolist())
-    dirty = set(store.settle().tolist())
+    settled = store.settle()
+    assert np.array_equal(settled.before, before[settled.rows])
+    dirty = set(settled.rows.tolist())
     changed = set(
         np.flatnonzero(before[: store.num_rows] != store.columns.observable[: store.num_rows])
     )
@@ -219,7 +222,7 @@ def test_the_mean_observable_fades_as_one_over_n() -> None:
         points = rng.integers(0, 512, (400, 3)) + corner
         views = np.tile(np.array([VIEW, 0, 0], np.int16), (400, 1))
         store.insert(Ticks(points, views, NOBODY, np.zeros(3, np.int64), -1, {}))
-        flips[n] = len(store.settle()) / 400
+        flips[n] = len(store.settle().rows) / 400
     late = np.mean([n * flips[n] for n in range(80, 161)])
     assert 0.2 < late < 4.0
 

@@ -15,10 +15,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from facet.mapping.eigen import eigenvalues, eigenvector
-from facet.mapping.halo import take
 from facet.mapping.kernel import kernel
-from facet.mapping.region import MOST, covariance, decode, is_one_pose, shape, within, within_slab
+from facet.mapping.region import covariance, is_one_pose, shape
 from facet.mapping.settings import STEPS, MapSettings
+from facet.mapping.traces import (
+    COUNT,
+    FARTHEST,
+    KNOWN,
+    SLAB,
+    SLAB_UNIT,
+    THIN_SLAB,
+    ask,
+    list_votes,
+    slab_key,
+)
 
 EMPTY, VALID, ALIGNED, THICK, SPARSE, MIXED = range(6)
 WIDER = 255  # no class: the voxel must look farther than its halo
@@ -39,7 +49,7 @@ class Rule(NamedTuple):
     epsilon: float
     offset: float  # 1/8 voxels, of a voxel from the plane of its own region
     border: float  # 1/8 voxels per voxel of radius, in the plane, from the centroid of the region
-    slab: float  # 1/8 voxels, half width of the slab that votes in the second look
+    slab: float  # 1/8 voxels / SLAB_UNIT, half width of the slab that votes in the second look
     thin_slab: float  # likewise in the last look, where surfaces meet
     thin_passes: int
     thin_points: int
@@ -74,8 +84,8 @@ def make_rule(settings: MapSettings) -> Rule:
         epsilon=settings.epsilon,
         offset=settings.own_offset * STEPS,
         border=settings.border * STEPS,
-        slab=settings.slab * STEPS,
-        thin_slab=settings.thin_slab * STEPS,
+        slab=settings.slab * STEPS * SLAB_UNIT,
+        thin_slab=settings.thin_slab * STEPS * SLAB_UNIT,
         thin_passes=settings.thin_passes,
         thin_points=settings.thin_points,
         thin_share=settings.thin_share,
@@ -90,7 +100,7 @@ def make_rule(settings: MapSettings) -> Rule:
     )
 
 
-@kernel
+@kernel(allocates=False)
 def _step(sums, r, rule):  # type: ignore[no-untyped-def]
     """The next radius by eq. 16-20: at least one voxel up or down, at most double or half."""
     votes = min(sums[0], rule.growth.shape[0] - 1)
@@ -106,67 +116,67 @@ def _step(sums, r, rule):  # type: ignore[no-untyped-def]
     return min(rule.largest, max(1, r_next))
 
 
-@kernel
-def _find_radius(halo, margin, x, y, z, seen, rule, scratch):  # type: ignore[no-untyped-def]
-    """Follow the radius until it repeats; of a cycle the smallest. (radius, reach, votes): reach is
-    the largest radius that was looked at, and so far `votes` are listed; radius 0 where it would
-    leave the halo."""
-    lists, votes, sums = scratch
+@kernel(allocates=False)
+def _find_radius(at, rule, scratch):  # type: ignore[no-untyped-def]
+    """Follow the radius until it repeats; of a cycle the smallest. (radius, reach): reach is the
+    largest radius that was looked at; radius 0 where it would leave the halo."""
+    sums, state = scratch[2], scratch[5]
     r = rule.start
     reach = r
-    count = take(halo, margin, x, y, z, r, MOST, seen >> 32 != 0, lists)
-    decode(lists, count, seen, x + margin, y + margin, z + margin, votes)
     visited = np.int64(0)
-    while True:
-        within(votes, count, r, sums)
+    while ask(at, r, reach, scratch):
         visited |= np.int64(1) << r
         r_next = _step(sums, r, rule)
         if r_next == r or (visited >> r_next) & 1:
-            if r_next < r:
-                within(votes, count, r_next, sums)
-            return min(r, r_next), reach, count
+            if r_next < r and not ask(at, r_next, reach, scratch):
+                break
+            return min(r, r_next), reach
         r = r_next
-        if r > margin:
-            return 0, reach, count
-        if r > reach:
-            reach = r
-            count = take(halo, margin, x, y, z, r, MOST, seen >> 32 != 0, lists)
-            decode(lists, count, seen, x + margin, y + margin, z + margin, votes)
+        reach = max(r, reach)
+        if reach > FARTHEST:
+            state[KNOWN] = 0
+    return 0, reach
 
 
-@kernel
-def estimate(halo, margin, local, seen, rule, scratch):  # type: ignore[no-untyped-def]
-    """(class, nx, ny, nz, gamma in half degrees, at a border, reach) of a voxel of the block that
-    `halo` surrounds; class WIDER where the halo is too narrow to tell."""
-    lists, votes, sums = scratch
+@kernel(allocates=False)
+def estimate(at, scratch):  # type: ignore[no-untyped-def]
+    """(class, nx, ny, nz, gamma in half degrees, at a border, reach) of a voxel; class WIDER where
+    its halo is too narrow to tell.
+
+    at: halo, its margin, the voxel's place in the block, its observable, rule."""
+    _, _, _, seen, rule = at
+    lists, votes, sums, _, _, state, _ = scratch
     if seen == 0:
         return EMPTY, 0, 0, 0, 0, False, 0
-    x, y, z = local & 7, (local >> 3) & 7, local >> 6
-    r, reach, count = _find_radius(halo, margin, x, y, z, seen, rule, scratch)
-    if r == 0:
+    r, reach = _find_radius(at, rule, scratch)
+    one_line = seen >> 32 != 0
+    if r == 0 or (one_line and not list_votes(at, reach, scratch)):
         return WIDER, 0, 0, 0, 0, False, 0
     if sums[0] < rule.sparse:
         return SPARSE, 0, 0, 0, 0, False, reach
-    one_pose = seen >> 32 != 0 and is_one_pose(lists, votes, count, r)
+    one_pose = one_line and is_one_pose(lists, votes, state[COUNT], r)
     kind, nx, ny, nz, tan_gamma = _classify(sums, seen, one_pose, rule)
     every, whole = sums[0], tan_gamma  # of all that the region holds
     outlier = rule.outlier * ((seen >> 12) & 15) * sums[0] <= sums[1]  # of few points, among many
     beside = kind == THICK and tan_gamma <= rule.tan_theta  # a plane, not on it: a noise shell
     if kind != ALIGNED and (outlier or beside):
         return THICK, 0, 0, 0, 255, False, reach
-    region = votes, count, r, seen, one_pose
+    region = at, r, reach, one_pose
     first = r  # radius of the region of the first normal: smaller where the full one is thick
     while kind != ALIGNED:
         passes = 1 if kind == VALID else rule.passes
         kind, nx, ny, nz, tan_gamma = _look_again(
-            region, nx, ny, nz, rule.slab, passes, rule.sparse, rule, sums
+            region, nx, ny, nz, SLAB, passes, rule.sparse, scratch
         )
+        if kind == WIDER:
+            return WIDER, 0, 0, 0, 0, False, 0
         if kind == SPARSE:
             return SPARSE, 0, 0, 0, 0, False, reach
         first -= 1
         if kind == VALID or first < max(1, r - rule.shrink):
             break
-        within(votes, count, first, sums)
+        if not ask(at, first, reach, scratch):
+            return WIDER, 0, 0, 0, 0, False, 0
         if sums[0] < rule.least_first:
             break
         _, nx, ny, nz, _ = _classify(sums, seen, one_pose, rule)
@@ -176,8 +186,10 @@ def estimate(halo, margin, local, seen, rule, scratch):  # type: ignore[no-untyp
     if nearly and dense and r > 1:  # a step: a narrow face between two
         least = (every + rule.thin_share - 1) // rule.thin_share
         kind, nx, ny, nz, tan_gamma = _look_again(
-            region, nx, ny, nz, rule.thin_slab, rule.thin_passes, least, rule, sums
+            region, nx, ny, nz, THIN_SLAB, rule.thin_passes, least, scratch
         )
+        if kind == WIDER:
+            return WIDER, 0, 0, 0, 0, False, 0
         if kind == SPARSE:  # a slice of a lump
             return THICK, 0, 0, 0, 255, False, reach
     if kind == VALID and (seen >> 31) & 1 == 1 and _towards(seen, nx, ny, nz) < 4.0:
@@ -194,23 +206,28 @@ def estimate(halo, margin, local, seen, rule, scratch):  # type: ignore[no-untyp
     )
 
 
-@kernel
-def _look_again(region, nx, ny, nz, slab, passes, least, rule, sums):  # type: ignore[no-untyped-def]
+@kernel(allocates=False)
+def _look_again(region, nx, ny, nz, slab, passes, least, scratch):  # type: ignore[no-untyped-def]
     """Class and normal again, and again: of the votes on the voxel's own side, by the last normal,
     and in its own slab; SPARSE where these are fewer than `least`."""
-    votes, count, r, seen, one_pose = region
-    cx, cy, cz = seen & 15, (seen >> 4) & 15, (seen >> 8) & 15
+    at, r, reach, one_pose = region
+    seen, rule, sums = at[3], at[4], scratch[2]
     kind, tan_gamma = SPARSE, 0.0
+    last = np.int64(-1)
     for _ in range(passes):
-        own = nx * cx + ny * cy + nz * cz
-        within_slab(votes, count, r, nx, ny, nz, own, slab, sums)
+        key = slab_key(r, slab, nx, ny, nz)
+        if key == last:  # and so on for ever
+            break
+        last = key
+        if not ask(at, key, reach, scratch):
+            return WIDER, nx, ny, nz, 0.0
         if sums[0] < least:
             return SPARSE, nx, ny, nz, 0.0
         kind, nx, ny, nz, tan_gamma = _classify(sums, seen, one_pose, rule)
     return kind, nx, ny, nz, tan_gamma
 
 
-@kernel
+@kernel(allocates=False)
 def _at_border(sums, seen, r, nx, ny, nz, rule):  # type: ignore[no-untyped-def]
     """Whether the votes lie to one side of the voxel, in the plane."""
     w = float(sums[1])
@@ -221,7 +238,7 @@ def _at_border(sums, seen, r, nx, ny, nz, rule):  # type: ignore[no-untyped-def]
     return (dx * dx + dy * dy + dz * dz) - along * along > (rule.border * r) ** 2
 
 
-@kernel
+@kernel(allocates=False)
 def _towards(seen, nx, ny, nz):  # type: ignore[no-untyped-def]
     """The normal along the view direction of the voxel with observable `seen`."""
     return (
@@ -231,7 +248,7 @@ def _towards(seen, nx, ny, nz):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel
+@kernel(allocates=False)
 def _classify(sums, seen, one_pose, rule):  # type: ignore[no-untyped-def]
     """(class, normal towards the view, tan gamma) of the voxel with observable `seen`."""
     a, b, c, d, e, f = covariance(sums)

@@ -17,13 +17,13 @@ EMPTY = np.int64(-1)
 CENTRE = 13  # a block's own place among its 27 neighbours
 
 
-@kernel
+@kernel(allocates=False)
 def pack(i: int, j: int, k: int) -> int:
     """One sortable int64 from three indices in [-2^20, 2^20)."""
     return ((i + OFFSET) << 42) | ((j + OFFSET) << 21) | (k + OFFSET)
 
 
-@kernel
+@kernel(allocates=False)
 def unpack(key: int) -> tuple[int, int, int]:
     """The inverse of `pack`."""
     return (key >> 42) - OFFSET, ((key >> 21) & MASK) - OFFSET, (key & MASK) - OFFSET
@@ -51,7 +51,7 @@ def hash_key(key: Any) -> Any:
     return np.int64((z ^ (z >> np.uint64(31))) >> np.uint64(1))
 
 
-@kernel
+@kernel(allocates=False)
 def find(table_keys: Int64Array, table_values: NDArray[np.int32], key: Any) -> Any:
     """The value stored under `key`, or -1. Table size is a power of two, never full."""
     mask = table_keys.shape[0] - 1
@@ -99,7 +99,7 @@ class Blocks(NamedTuple):
     neighbours: NDArray[np.int32]  # (B, 27) at (dx+1) + 3 (dy+1) + 9 (dz+1), -1: none
 
 
-@kernel
+@kernel(allocates=False)
 def row_at(blocks: Blocks, block: int, local: int) -> Any:
     """The row of a voxel at local index x + 8 y + 64 z of a block, or -1."""
     return blocks.rows[blocks.lines[block, local >> 3], local & 7] - 1

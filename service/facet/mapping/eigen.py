@@ -7,7 +7,7 @@ import numpy as np
 from facet.mapping.kernel import kernel
 
 
-@kernel
+@kernel(allocates=False)
 def eigenvalues(a, b, c, d, e, f):  # type: ignore[no-untyped-def]
     """Eigenvalues, descending, of [[a, d, e], [d, b, f], [e, f, c]] (Smith 1961, closed form).
 
@@ -30,7 +30,7 @@ def eigenvalues(a, b, c, d, e, f):  # type: ignore[no-untyped-def]
     return q + p * (t + spread), q + p * (t - spread), q - 2.0 * p * t
 
 
-@kernel
+@kernel(allocates=False)
 def eigenvector(a, b, c, d, e, f, value):  # type: ignore[no-untyped-def]
     """Unit eigenvector of that matrix for a simple eigenvalue; (0, 0, 1) where none is clear."""
     x0, y0, z0 = a - value, d, e
@@ -54,7 +54,7 @@ def eigenvector(a, b, c, d, e, f, value):  # type: ignore[no-untyped-def]
     return ux / length, uy / length, uz / length
 
 
-@kernel
+@kernel(allocates=False)
 def smallest(scatter):  # type: ignore[no-untyped-def]
     """(variance, nx, ny, nz, middle, largest) of a scatter (xx, xy, xz, yy, yz, zz)."""
     a, d, e, b, f, c = scatter[0], scatter[1], scatter[2], scatter[3], scatter[4], scatter[5]

@@ -42,7 +42,7 @@ def make_halos(count: int) -> Halo:
     )
 
 
-@kernel
+@kernel(allocates=False)
 def find_near(blocks, block, blocks_out, near):  # type: ignore[no-untyped-def]
     """Number the blocks up to `blocks_out` away into near, x fastest; -1: none."""
     bi, bj, bk = unpack(blocks.keys[block])
@@ -60,7 +60,7 @@ def find_near(blocks, block, blocks_out, near):  # type: ignore[no-untyped-def]
                 n += 1
 
 
-@kernel
+@kernel(allocates=False)
 def fill_rows(masks, near, blocks_out, margin, rows):  # type: ignore[no-untyped-def]
     """Bits of masks (B, 8), voxels up to `margin` beyond the middle one of the blocks `near`, as
     rows along x: bit 0 lies at x = -margin."""
@@ -85,7 +85,7 @@ def fill_rows(masks, near, blocks_out, margin, rows):  # type: ignore[no-untyped
                 rows[(z0 + z) * edge + y0 + y] |= byte & all_bits
 
 
-@kernel
+@kernel(allocates=False)
 def gather(blocks, observable, block, margin, halo):  # type: ignore[no-untyped-def]
     """List the occupied voxels up to `margin` (at most WIDEST) beyond a block."""
     blocks_out = (margin + 7) >> 3
@@ -118,7 +118,7 @@ def gather(blocks, observable, block, margin, halo):  # type: ignore[no-untyped-
             count += 1
 
 
-@kernel
+@kernel(allocates=False)
 def take(halo, margin, x, y, z, r, most, poses_too, out):  # type: ignore[no-untyped-def]
     """Copy what lies within r (Chebyshev, at most `margin`) of the voxel x, y, z of the block to
     out (LISTS, > most), the high halves of the observables if `poses_too`. Returns how many."""
@@ -139,7 +139,8 @@ def take(halo, margin, x, y, z, r, most, poses_too, out):  # type: ignore[no-unt
             if count + end - start > most:
                 return count
             if poses_too:
-                out_poses[count : count + end - start] = poses[start:end]
+                for i in range(start, end):
+                    out_poses[count + i - start] = poses[i]
             for i in range(start, end):
                 out_words[count] = words[i]
                 out_places[count] = places[i]

@@ -28,15 +28,23 @@ def _writable() -> bool:
 _WRITABLE = _writable()
 
 
-def kernel(function: Callable[..., Any] | None = None, *, parallel: bool = False) -> Any:
-    """Compile a loop: without the interpreter's lock, cached, on all cores if `parallel`."""
+def kernel(
+    function: Callable[..., Any] | None = None, *, parallel: bool = False, allocates: bool = True
+) -> Any:
+    """Compile a loop: without the interpreter's lock, cached, on all cores if `parallel`.
+
+    One that makes no array (allocates=False) borrows those it is given. Else it counts references
+    to each of them, an atomic operation at every call and every look into a tuple: half of the time
+    of small loops, and more where two threads count at the same arrays. (The option is numba's own
+    name for it; one that does make an array is then refused by the compiler.)"""
     if function is None:
-        return lambda own: kernel(own, parallel=parallel)
+        return lambda own: kernel(own, parallel=parallel, allocates=allocates)
+    options = {} if allocates else {"_nrt": False}
     config: Any = numba.config
     before = config.CACHE_DIR
     if _WRITABLE:
         config.CACHE_DIR = str(CACHE)
     try:
-        return njit(cache=True, nogil=True, parallel=parallel)(function)
+        return njit(cache=True, nogil=True, parallel=parallel, **options)(function)
     finally:
         config.CACHE_DIR = before

@@ -113,13 +113,13 @@ class Mapper:
         done("settle")
         num_stale, turned = self._normals.update(store, dirty)
         done("normals")
-        moved = np.unique(store.columns.block[dirty])
+        moved = np.unique(store.columns.block[dirty.rows])
         grouped = self.group(np.union1d(turned, moved), moved, touched, done)
         lineage = self._identity.assign(len(grouped.points.total), self._heritage())
         updated = self.outline(lineage.ids, grouped, done)
         self.work = {
             "touched_voxels": len(touched.rows),
-            "dirty_voxels": len(dirty),
+            "dirty_voxels": len(dirty.rows),
             "stale_voxels": num_stale,
             "blocks_regrouped": len(grouped.regrouped),
             "blocks_relabelled": len(grouped.relabelled),

@@ -22,18 +22,28 @@ from facet.mapping.adaptive import (
 )
 from facet.mapping.bits import trailing_zeros
 from facet.mapping.blocks import row_at
-from facet.mapping.halo import LISTS, Halo, gather, make_halos
+from facet.mapping.halo import Halo, gather, make_halos
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory, grow_all
-from facet.mapping.region import COLUMNS, MOST, SUMS
 from facet.mapping.settings import MapSettings
 from facet.mapping.staleness import find_candidates, find_stale, mark_dirty
-from facet.mapping.store import VoxelStore
+from facet.mapping.store import Dirty, VoxelStore
+from facet.mapping.traces import (
+    KNOWN,
+    USED,
+    amend,
+    keep,
+    list_changes,
+    make_scratch,
+    make_traces,
+    recall,
+)
 
 CLASS_NAMES = ("empty", "valid", "aligned", "thick", "sparse", "mixed")
 SAME, CHANGED = 0, 1  # what became of a voxel, or WIDER
 NARROW, WIDE = 4, 8  # voxels that the first and the second halo of a block reach beyond it
 SHARES = 16  # parts that the blocks are dealt out to; threads take them
+RUN = 16  # blocks, beside one another in memory, that fall to the same share
 
 
 class Normals(NamedTuple):
@@ -46,11 +56,10 @@ class Normals(NamedTuple):
     reach: NDArray[np.uint8]  # largest radius that was looked at, voxels
 
 
-@kernel
-def _estimate_row(halo, margin, observable, normals, row, local, rule, scratch):  # type: ignore[no-untyped-def]
+@kernel(allocates=False)
+def _estimate_row(at, normals, row, scratch):  # type: ignore[no-untyped-def]
     """Estimate one row and write it. SAME, CHANGED, or WIDER where nothing was written."""
-    seen = observable[row]
-    kind, nx, ny, nz, gamma, border, reach = estimate(halo, margin, local, seen, rule, scratch)
+    kind, nx, ny, nz, gamma, border, reach = estimate(at, scratch)
     if kind == WIDER:
         return WIDER
     unit = normals.unit[row]
@@ -70,14 +79,20 @@ def _estimate_row(halo, margin, observable, normals, row, local, rule, scratch):
     return CHANGED if changed else SAME
 
 
-@kernel
-def _estimate_block(blocks, observable, normals, block, stale, rule, halo, scratch):  # type: ignore[no-untyped-def]
+@kernel(allocates=False)
+def _estimate_block(  # type: ignore[no-untyped-def]
+    blocks, observable, normals, block, stale, dirty, num_changes, rule, halo, traces, share,
+    scratch
+):  # fmt: skip
     """Estimate the voxels of a block whose bit is set in stale (8,), which comes back clear.
-    Whether any changed. Few need to look far: the wider halos are gathered for them alone."""
+    Whether any changed. Few need to look far: the wider halos are gathered for them alone.
+
+    dirty (8,): bits of its dirty voxels; num_changes: dirty voxels round it, -1: too many."""
     turned = False
-    for margin in (min(NARROW, rule.largest), min(WIDE, rule.largest), rule.largest):
+    state = scratch[5]
+    for narrow, margin in ((True, NARROW), (False, WIDE), (False, rule.largest)):
         left = np.uint64(0)
-        gather(blocks, observable, block, margin, halo)
+        gather(blocks, observable, block, min(margin, rule.largest), halo)
         for z in range(8):
             word = stale[z]
             while word != np.uint64(0):
@@ -85,7 +100,19 @@ def _estimate_block(blocks, observable, normals, block, stale, rule, halo, scrat
                 word &= word - np.uint64(1)
                 local = 64 * z + bit
                 row = row_at(blocks, block, local)
-                became = _estimate_row(halo, margin, observable, normals, row, local, rule, scratch)
+                seen = observable[row]
+                one_line = seen >> 32 != 0  # asks for more than sums
+                whole = recall(traces, share, row, scratch)
+                if num_changes < 0 or (dirty[z] >> np.uint64(bit)) & np.uint64(1):
+                    state[KNOWN] = 0
+                elif narrow and not (
+                    amend(num_changes, local, seen, rule, scratch) or one_line or not whole
+                ):
+                    stale[z] &= ~(np.uint64(1) << np.uint64(bit))
+                    continue
+                at = halo, min(margin, rule.largest), local, seen, rule
+                became = _estimate_row(at, normals, row, scratch)
+                keep(traces, share, row, -1 if became == WIDER else state[USED], scratch)
                 if became != WIDER:
                     stale[z] &= ~(np.uint64(1) << np.uint64(bit))
                     turned |= became == CHANGED
@@ -95,7 +122,7 @@ def _estimate_block(blocks, observable, normals, block, stale, rule, halo, scrat
     return turned
 
 
-@kernel
+@kernel(allocates=False)
 def _deepest(blocks, reach, block):  # type: ignore[no-untyped-def]
     """The largest reach of a block's voxels."""
     largest = np.uint8(0)
@@ -107,32 +134,35 @@ def _deepest(blocks, reach, block):  # type: ignore[no-untyped-def]
 
 
 @kernel(parallel=True)
-def _refresh(blocks, columns, normals, deepest, dirty, which, rule, halos, counts, turned):  # type: ignore[no-untyped-def]
+def _refresh(  # type: ignore[no-untyped-def]
+    blocks, columns, normals, deepest, dirty, changes, which, rule, halos, traces, counts, turned
+):
     """Estimate again what is stale in the blocks `which` (C,); counts (C,) says how many voxels,
-    turned (C,) whether any of them changed.
+    turned (C,) whether any of them changed. dirty: (B, 8) bits of dirty voxels; changes: these as
+    rows, observables before, and lists by block (`mark_dirty`).
 
-    Every voxel depends on observables alone and writes its own place: threads change nothing."""
-    shares = halos.rows.shape[0]
-    for share in prange(shares):
+    Every voxel depends on observables alone and writes its own place: threads change nothing. A
+    block always falls to the same share: the traces of its voxels lie there."""
+    for share in prange(halos.rows.shape[0]):
         halo = Halo(halos.listed[share], halos.rows[share], halos.first[share], halos.near[share])
-        scratch = (
-            np.empty((LISTS, MOST + 16), np.int32),  # 16: columns start on different cache sets
-            np.empty((COLUMNS, MOST + 16), np.int32),
-            np.zeros(SUMS, np.int64),
-        )
+        scratch = make_scratch(traces.keys.shape[2])
         stale = np.zeros(8, np.uint64)
-        start = share * which.shape[0] // shares  # blocks beside one another share cache lines
-        for q in range(start, (share + 1) * which.shape[0] // shares):
+        for q in range(which.shape[0]):
             block = which[q]
+            if (block // RUN) % halos.rows.shape[0] != share:
+                continue
             counts[q] = find_stale(
                 blocks, dirty, normals.reach, block, deepest[1 + block], rule.start,
                 halo.near, halo.rows, stale,
             )  # fmt: skip
             turned[q] = False
             if counts[q] > 0:
+                blocks_out = (max(rule.start, deepest[1 + block]) + 7) >> 3
+                num = list_changes(blocks, columns, changes, halo.near, blocks_out, scratch[6])
                 turned[q] = _estimate_block(
-                    blocks, columns.observable, normals, block, stale, rule, halo, scratch
-                )
+                    blocks, columns.observable, normals, block, stale, dirty[block], num, rule,
+                    halo, traces, share, scratch,
+                )  # fmt: skip
                 deepest[1 + block] = _deepest(blocks, normals.reach, block)
 
 
@@ -152,8 +182,10 @@ class NormalField:
         )
         self._deepest = np.zeros(1, np.uint8)  # largest reach of all, then by block
         self._dirty = np.zeros((0, 8), np.uint64)
+        self._first = np.zeros(0, np.int32)  # dirty voxels by block, see mark_dirty
         self._flags = np.zeros(0, np.bool_)
         self._halos = make_halos(SHARES)
+        self._traces = make_traces(SHARES)
 
     def restore(self, store: VoxelStore, normals: Normals) -> None:
         """Take over what was derived of all voxels of a store. Raises ValueError for misfits."""
@@ -169,20 +201,23 @@ class NormalField:
         np.maximum.at(self._deepest, store.columns.block[: store.num_rows] + 1, normals.reach)
         self._deepest[0] = normals.reach.max(initial=0)
 
-    def update(self, store: VoxelStore, dirty: NDArray[np.int32]) -> tuple[int, NDArray[np.int32]]:
-        """Re-estimate what `dirty` rows (D,) made stale.
+    def update(self, store: VoxelStore, dirty: Dirty) -> tuple[int, NDArray[np.int32]]:
+        """Re-estimate what `dirty` voxels made stale.
 
         Returns (number of stale voxels, blocks in which a derived value changed)."""
         self._fit(store)
         near = np.empty(store.num_blocks, np.int32)
-        sources = near[: mark_dirty(store.columns, dirty, self._dirty, self._flags, near)].copy()
+        changes = *dirty, self._first, np.empty(len(dirty.rows), np.int32)
+        count = mark_dirty(store.columns, dirty.rows, self._dirty, *changes[2:], near)
+        sources = near[:count].copy()
         which = self._candidates(store, sources)
         counts, turned = np.empty(len(which), np.int32), np.empty(len(which), np.bool_)
         _refresh(
-            store.blocks, store.columns, self.normals, self._deepest, self._dirty, which,
-            self._rule, self._halos, counts, turned,
+            store.blocks, store.columns, self.normals, self._deepest, self._dirty, changes, which,
+            self._rule, self._halos, self._traces, counts, turned,
         )  # fmt: skip
         self._dirty[sources] = 0
+        self._first[sources] = 0
         self._deepest[0] = self._deepest[1:].max(initial=0)
         return int(counts.sum()), which[turned]
 
@@ -195,11 +230,14 @@ class NormalField:
         rows, blocks = len(store.columns.block), len(store.blocks.keys)
         if len(self.normals.kind) < rows:
             self.normals = grow_all(self._memory, self.normals, self._num_rows, rows)
+            slot = self._memory.grown(self._traces.slot, self._num_rows, rows)
+            self._traces = self._traces._replace(slot=slot)
         if len(self._dirty) < blocks:
             grown, used = self._memory.grown, self._num_blocks
             self._deepest = grown(self._deepest, 1 + used, 1 + blocks)
             self._dirty = grown(self._dirty, 0, blocks)
             self._flags = grown(self._flags, 0, blocks)
+            self._first = grown(self._first, 0, blocks)
         self._num_rows, self._num_blocks = store.num_rows, store.num_blocks
 
 

@@ -76,7 +76,7 @@ def empty_patches() -> Patches:
     )
 
 
-@kernel
+@kernel(allocates=False)
 def _join(votes, centroid, unit, count, c, n, grouping):  # type: ignore[no-untyped-def]
     """Index of the patch that takes a voxel at c (eighths) with normal n; -1: none."""
     best, best_cost = -1, 2.0
@@ -155,7 +155,7 @@ def _group(blocks, observable, normals, patches, block, grouping, scratch):  # t
     return count
 
 
-@kernel
+@kernel(allocates=False)
 def _store(blocks, patches, block, count, scratch):  # type: ignore[no-untyped-def]
     """Write a block's grouping. Returns whether it differs from what was there."""
     votes, centroid, scatter, unit, box, label = scratch
@@ -214,14 +214,13 @@ def _group_all(blocks, observable, normals, patches, which, grouping, changed): 
         _group_some(blocks, observable, normals, patches, which, start, stop, grouping, changed)
 
 
-@kernel
-def _add_points(blocks, columns, border, patches, block, pure, m, total):  # type: ignore[no-untyped-def]
+@kernel(allocates=False)
+def _add_points(blocks, columns, border, patches, block, pure, m, total, sums):  # type: ignore[no-untyped-def]
     """Sum the members' point moments about the block corner into m (PER_BLOCK, 10): of all, or
     only of `pure` ones: not at a border, and claimed by no plane at an angle. Count the points of
     all members in total (PER_BLOCK,)."""
     m[:] = 0
     total[:] = 0
-    sums = np.empty(SUMS, np.int64)
     for z in range(8):
         word = blocks.occupied[block, z]
         while word != np.uint64(0):
@@ -238,10 +237,9 @@ def _add_points(blocks, columns, border, patches, block, pure, m, total):  # typ
                 shift_moments(sums, bit & 7, bit >> 3, z, m[p])
 
 
-@kernel
-def _variance(m):  # type: ignore[no-untyped-def]
-    """Smallest principal variance of point moments."""
-    spread = np.empty(6)
+@kernel(allocates=False)
+def _variance(m, spread):  # type: ignore[no-untyped-def]
+    """Smallest principal variance of point moments; spread (6,): room."""
     n = float(m[0])
     s = 0
     for a in range(3):
@@ -258,12 +256,13 @@ def _sum_some(blocks, columns, border, patches, which, start, stop, rungs, histo
     pure = np.empty((PER_BLOCK, MOMENTS), np.int64)
     whole = np.empty((PER_BLOCK, MOMENTS), np.int64)
     total = np.empty(PER_BLOCK, np.int64)
+    sums, spread = np.empty(SUMS, np.int64), np.empty(6)
     for q in range(start, stop):
         block = which[q]
-        _add_points(blocks, columns, border, patches, block, True, pure, total)
+        _add_points(blocks, columns, border, patches, block, True, pure, total, sums)
         count = np.int64(patches.number[block])
         if np.any(PURE_SHARE * pure[:count, 0] < total[:count]):
-            _add_points(blocks, columns, border, patches, block, False, whole, total)
+            _add_points(blocks, columns, border, patches, block, False, whole, total, sums)
         for p in range(PER_BLOCK):
             votes = patches.counted[block, p]
             if votes > 0:
@@ -271,7 +270,9 @@ def _sum_some(blocks, columns, border, patches, which, start, stop, rungs, histo
             patches.counted[block, p] = 0
             if p >= count:
                 continue
-            variance = _variance(pure[p] if PURE_SHARE * pure[p, 0] >= total[p] else whole[p])
+            variance = _variance(
+                pure[p] if PURE_SHARE * pure[p, 0] >= total[p] else whole[p], spread
+            )
             rung = 0
             while rung < RUNGS - 1 and variance > rungs[rung]:
                 rung += 1

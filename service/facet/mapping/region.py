@@ -17,7 +17,7 @@ COLUMNS = 9  # x, y, z (1/8 voxel from the voxel's corner), weight, view x, y, z
 SUMS = 11  # number, weight, w x, y, z, w xx, xy, xz, yy, yz, zz
 
 
-@kernel
+@kernel(allocates=False)
 def decode(lists, count, seen, x0, y0, z0, votes):  # type: ignore[no-untyped-def]
     """Unpack what was listed round a voxel at packed place (x0, y0, z0) with observable `seen` into
     votes (COLUMNS, MOST) int32. A vote is of the voxel's side where their views differ by less than
@@ -51,17 +51,33 @@ def decode(lists, count, seen, x0, y0, z0, votes):  # type: ignore[no-untyped-de
         view_x[i] = ((word >> 16) & 31) - 8
         view_y[i] = ((word >> 21) & 31) - 8
     for i in range(count):
-        word = words[i]
-        ox = np.int32(((word >> 16) & 31) - 8)
-        oy = np.int32(((word >> 21) & 31) - 8)
-        oz = np.int32(((word >> 26) & 31) - 8)
-        view_z[i] = oz
-        dot = np.int32(min(0, np.int32(vx * ox + vy * oy + vz * oz)))
-        near = np.int32(4 * dot * dot) <= np.int32(length2 * np.int32(ox * ox + oy * oy + oz * oz))
-        side[i] = any_side | (np.int32(near) & ((word >> 31) + 1))
+        view_z[i] = ((words[i] >> 26) & 31) - 8
+        side[i] = any_side | _is_near(vx, vy, vz, length2, words[i])
 
 
-@kernel
+@kernel(allocates=False)
+def _is_near(vx, vy, vz, length2, word):  # type: ignore[no-untyped-def]
+    """Whether (1, 0) the view of a vote, that was seen from one side, is near a view."""
+    ox = np.int32(((word >> 16) & 31) - 8)
+    oy = np.int32(((word >> 21) & 31) - 8)
+    oz = np.int32(((word >> 26) & 31) - 8)
+    dot = np.int32(min(0, np.int32(vx * ox + vy * oy + vz * oz)))
+    near = np.int32(4 * dot * dot) <= np.int32(length2 * np.int32(ox * ox + oy * oy + oz * oz))
+    return np.int32(near) & ((word >> 31) + 1)
+
+
+@kernel(allocates=False)
+def is_beside(seen, word):  # type: ignore[no-untyped-def]
+    """Whether a vote is of the side of the voxel with observable `seen`, as `decode` says."""
+    if (seen >> 31) & 1 == 1:
+        return True
+    vx = np.int32(((seen >> 16) & 31) - 8)
+    vy = np.int32(((seen >> 21) & 31) - 8)
+    vz = np.int32(((seen >> 26) & 31) - 8)
+    return _is_near(vx, vy, vz, np.int32(vx * vx + vy * vy + vz * vz), np.int32(word)) == 1
+
+
+@kernel(allocates=False)
 def within(votes, count, r, sums):  # type: ignore[no-untyped-def]
     """Sums of the votes of the voxel's side within r."""
     x, y, z, w, distance, side = votes[0], votes[1], votes[2], votes[3], votes[7], votes[8]
@@ -85,7 +101,7 @@ def within(votes, count, r, sums):  # type: ignore[no-untyped-def]
     sums[5], sums[6], sums[7], sums[8], sums[9], sums[10] = sxx, sxy, sxz, syy, syz, szz
 
 
-@kernel
+@kernel(allocates=False)
 def is_one_pose(lists, votes, count, r):  # type: ignore[no-untyped-def]
     """Whether all votes of the voxel's side within r come from one known line-scan pose."""
     poses, distance, side = lists[1], votes[7], votes[8]
@@ -98,14 +114,14 @@ def is_one_pose(lists, votes, count, r):  # type: ignore[no-untyped-def]
     return known != 0
 
 
-@kernel
-def within_slab(votes, count, r, nx, ny, nz, own, slab, sums):  # type: ignore[no-untyped-def]
-    """Sums of the votes within r that were seen from the side of the normal and whose centroid
-    lies within `slab` of n . c = own."""
+@kernel(allocates=False)
+def within_slab(votes, count, r, nx, ny, nz, own, half, sums):  # type: ignore[no-untyped-def]
+    """Sums of the votes within r that were seen from the side of the normal, whole numbers, and
+    whose centroid lies within `half` of n . c = own."""
     x, y, z, w, distance = votes[0], votes[1], votes[2], votes[3], votes[7]
     view_x, view_y, view_z = votes[4], votes[5], votes[6]
     fx, fy, fz = np.float32(nx), np.float32(ny), np.float32(nz)
-    middle, half = np.float32(own), np.float32(slab)
+    middle, farthest = np.float32(own), np.float32(half)  # whole numbers, all below 2^24
     nothing = np.float32(0.0)
     zero, unit = np.int32(0), np.int32(1)
     number, weight, sx, sy, sz = zero, zero, zero, zero, zero
@@ -115,7 +131,7 @@ def within_slab(votes, count, r, nx, ny, nz, own, slab, sums):  # type: ignore[n
         towards = (
             fx * np.float32(view_x[i]) + fy * np.float32(view_y[i]) + fz * np.float32(view_z[i])
         )
-        inside = (distance[i] <= r) & (abs(off) <= half) & (towards > nothing)
+        inside = (distance[i] <= r) & (abs(off) <= farthest) & (towards > nothing)
         one = unit if inside else zero
         number = np.int32(number + one)
         wi = np.int32(w[i] * one)
@@ -132,7 +148,7 @@ def within_slab(votes, count, r, nx, ny, nz, own, slab, sums):  # type: ignore[n
     sums[5], sums[6], sums[7], sums[8], sums[9], sums[10] = sxx, sxy, sxz, syy, syz, szz
 
 
-@kernel
+@kernel(allocates=False)
 def covariance(sums):  # type: ignore[no-untyped-def]
     """(xx, yy, zz, xy, xz, yz) of the votes, population form (eq. 3), (1/8 voxel)^2."""
     one = 1.0 / sums[1]
@@ -147,7 +163,7 @@ def covariance(sums):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel
+@kernel(allocates=False)
 def shape(variances, floor2):  # type: ignore[no-untyped-def]
     """(lambda of eq. 18, tan gamma of eq. 9) of principal variances, floored."""
     s1 = max(variances[0], floor2)

@@ -11,23 +11,25 @@ from facet.mapping.kernel import kernel
 from facet.mapping.settings import BLOCK
 
 
-@kernel
-def mark_dirty(columns, rows, dirty, flags, out):  # type: ignore[no-untyped-def]
-    """Set the rows' bits in dirty (B, 8) and list their blocks once. Returns how many blocks."""
+@kernel(allocates=False)
+def mark_dirty(columns, rows, dirty, first, following, out):  # type: ignore[no-untyped-def]
+    """Set the rows' bits in dirty (B, 8) and list their blocks once. Returns how many blocks.
+
+    first (B,), zeros: 1 + the place in rows (D,) of a dirty voxel of the block, 0: none; following
+    (D,): likewise of the next one of the same block."""
     count = 0
     for d in range(rows.shape[0]):
         block, local = columns.block[rows[d]], columns.local[rows[d]]
         dirty[block, local >> 6] |= np.uint64(1) << np.uint64(local & 63)
-        if not flags[block]:
-            flags[block] = True
+        if first[block] == 0:
             out[count] = block
             count += 1
-    for q in range(count):
-        flags[out[q]] = False
+        following[d] = first[block]
+        first[block] = d + 1
     return count
 
 
-@kernel
+@kernel(allocates=False)
 def find_candidates(blocks, deepest, sources, flags, out):  # type: ignore[no-untyped-def]
     """Blocks that look as far as one of the blocks `sources`, these included. deepest (1 + B,):
     the largest reach of all, then by block. Returns how many."""
@@ -60,7 +62,7 @@ def find_candidates(blocks, deepest, sources, flags, out):  # type: ignore[no-un
     return count
 
 
-@kernel
+@kernel(allocates=False)
 def find_stale(blocks, dirty, reach, block, deepest, common, near, lines, stale):  # type: ignore[no-untyped-def]
     """Set in stale (8,) the bits of a block's voxels that look at a dirty one, or are dirty
     themselves. `common` is the reach that most voxels have. Returns how many."""
@@ -92,7 +94,7 @@ def find_stale(blocks, dirty, reach, block, deepest, common, near, lines, stale)
     return count
 
 
-@kernel
+@kernel(allocates=False)
 def _column(lines, edge, y, z, r):  # type: ignore[no-untyped-def]
     """All rows within r of the row (y, z), one over the other."""
     seen = np.uint64(0)

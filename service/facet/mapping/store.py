@@ -44,6 +44,13 @@ SETTLED = 64  # from so many points on a centroid is rounded to 1/4 voxel: it mo
 NOTED = 1 << 15  # touched voxels whose sums before are noted: more come in no few scans
 
 
+class Dirty(NamedTuple):
+    """Voxels whose observable changed."""
+
+    rows: NDArray[np.int32]  # (D,)
+    before: NDArray[np.int64]  # (D,) their observables when they were last settled
+
+
 class Touched(NamedTuple):
     """Voxels that points came to, or left."""
 
@@ -115,7 +122,7 @@ def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched
     return ticks.shape[0], (num_blocks, num_lines, num_rows, num_touched)
 
 
-@kernel
+@kernel(allocates=False)
 def _coarse(component):  # type: ignore[no-untyped-def]
     """A component of a direction, in eighths: 1, 4 or 7 with its sign. The sign is what tells the
     side of a surface; the rest mostly drifts with the sensor."""
@@ -128,7 +135,7 @@ def _coarse(component):  # type: ignore[no-untyped-def]
     return eighths if component >= 0.0 else -eighths
 
 
-@kernel
+@kernel(allocates=False)
 def observe(moments, views, poses):  # type: ignore[no-untyped-def]
     """A voxel's observable, 49 bits: centroid in eighths (4, 4, 4), from SETTLED points on in
     quarters; votes min(n, 8) (4); direction towards the sensor, `_coarse` (5, 5, 5); mixed (1);
@@ -159,7 +166,7 @@ def observe(moments, views, poses):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _settle(blocks, columns, touched_rows, num_touched, dirty_rows):  # type: ignore[no-untyped-def]
+def _settle(blocks, columns, touched_rows, num_touched, dirty_rows, before):  # type: ignore[no-untyped-def]
     """Refresh the observables of touched rows. Returns how many of them changed."""
     num_dirty = 0
     sums = np.empty(SUMS, np.int64)
@@ -170,6 +177,7 @@ def _settle(blocks, columns, touched_rows, num_touched, dirty_rows):  # type: ig
         word = observe(sums[:MOMENTS], sums[MOMENTS:], columns.poses[row])
         if word == columns.observable[row]:
             continue
+        before[num_dirty] = columns.observable[row]
         columns.observable[row] = word
         block, local = columns.block[row], columns.local[row]
         bit = np.uint64(1) << np.uint64(local & 63)
@@ -182,7 +190,7 @@ def _settle(blocks, columns, touched_rows, num_touched, dirty_rows):  # type: ig
     return num_dirty
 
 
-@kernel
+@kernel(allocates=False)
 def centroid(blocks, columns, row):  # type: ignore[no-untyped-def]
     """x, y, z of a voxel's rounded centroid, 1/8 voxels, whole."""
     i, j, k = unpack(blocks.keys[columns.block[row]])
@@ -314,12 +322,13 @@ class VoxelStore:
         self._touched_rows, self._num_touched = rows, len(rows)
         self._before[:] = 0
 
-    def settle(self) -> NDArray[np.int32]:
-        """Dirty rows (D,): those whose observable changed since the last call."""
-        dirty = np.empty(self._num_touched, np.int32)
-        count = _settle(self.blocks, self.columns, self._touched_rows, self._num_touched, dirty)
+    def settle(self) -> Dirty:
+        """The voxels whose observable changed since the last call."""
+        size = self._num_touched
+        dirty = Dirty(np.empty(size, np.int32), np.empty(size, np.int64))
+        count = _settle(self.blocks, self.columns, self._touched_rows, size, *dirty)
         self._num_touched = 0
-        return dirty[:count]
+        return Dirty(dirty.rows[:count], dirty.before[:count])
 
     def voxel_keys(self, rows: NDArray[np.int32]) -> NDArray[np.int64]:
         """(V, 3) voxel indices of rows (V,)."""

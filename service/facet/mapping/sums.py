@@ -23,7 +23,7 @@ HALF = 1 << (LOW - 1)  # low is kept in [-HALF, HALF)
 TOUCHED, DEEP = np.uint8(1), np.uint8(2)  # flags of a voxel: changed since settled; high is in use
 
 
-@kernel
+@kernel(allocates=False)
 def add_point(low, sign, x, y, z, view):  # type: ignore[no-untyped-def]
     """Add a point to the low parts (SUMS,) of a voxel. Whether they must be carried now."""
     n = low[0] + sign
@@ -40,7 +40,7 @@ def add_point(low, sign, x, y, z, view):  # type: ignore[no-untyped-def]
     return bits >> LOW != 0
 
 
-@kernel
+@kernel(allocates=False)
 def carry(low, middle, high, flags, row):  # type: ignore[no-untyped-def]
     """Bring the low parts of a voxel back into their range."""
     for s in range(low.shape[1]):
@@ -54,7 +54,7 @@ def carry(low, middle, high, flags, row):  # type: ignore[no-untyped-def]
             flags[row] |= DEEP
 
 
-@kernel
+@kernel(allocates=False)
 def read_sums(columns, row, out):  # type: ignore[no-untyped-def]
     """The sums of a voxel (SUMS,)."""
     for s in range(SUMS):
@@ -64,7 +64,7 @@ def read_sums(columns, row, out):  # type: ignore[no-untyped-def]
             out[s] += np.int64(columns.high[row, s]) << (LOW + MIDDLE)
 
 
-@kernel
+@kernel(allocates=False)
 def write_sums(columns, row, sums):  # type: ignore[no-untyped-def]
     """Make these (SUMS,) the sums of a voxel that has none."""
     for s in range(SUMS):
@@ -77,7 +77,7 @@ def write_sums(columns, row, sums):  # type: ignore[no-untyped-def]
             columns.flags[row] |= DEEP
 
 
-@kernel
+@kernel(allocates=False)
 def count_points(columns, row):  # type: ignore[no-untyped-def]
     """How many points a voxel holds."""
     n = np.int64(columns.low[row, 0]) + (np.int64(columns.middle[row, 0]) << LOW)
@@ -95,7 +95,7 @@ def sums_of(columns: Any, rows: NDArray[Any]) -> NDArray[np.int64]:
     return np.asarray(out)
 
 
-@kernel
+@kernel(allocates=False)
 def shift_moments(own, x, y, z, total):  # type: ignore[no-untyped-def]
     """Add moments (10,) to `total`, about a corner that lies x, y, z voxels before their own."""
     n, dx, dy, dz = own[0], TICKS * x, TICKS * y, TICKS * z

@@ -1,0 +1,284 @@
+"""Sums that were taken round a voxel, kept from one estimate of its normal to the next.
+
+An estimate asks for a handful of sums: of the votes within a radius, and of those among them that
+lie in a slab across a normal. Each has a key that says which, and is a pure function of the
+observables near by. Where two of a hundred and fifty votes changed, the kept sums are amended by
+these two: the same integers as if all were summed again. What is not kept is summed, so nothing
+depends on what is.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from facet.mapping.halo import LISTS, take
+from facet.mapping.kernel import kernel
+from facet.mapping.region import COLUMNS, MOST, SUMS, decode, is_beside, within, within_slab
+
+SLAB_UNIT = 64  # the normal across a slab is rounded: these integers are a unit vector times this
+CUBE, SLAB, THIN_SLAB = range(3)  # what a key asks for
+FARTHEST = 9  # (2 x 9 + 1)^3 votes are always listed whole; of wider regions nothing is kept
+MOST_KEPT = 12  # sums of a voxel
+PLACES = 8192  # voxels of a share whose sums are kept: the last ones that were estimated
+MOST_CHANGES = 256  # dirty voxels round a block; with more, summing all again is no slower
+KNOWN, USED, LISTED, COUNT, WHOLE = range(5)  # state: sums at hand; a bit each of those asked for;
+# radius up to which the votes are listed; how many these are; whether nothing asked for was dropped
+_VOTE = 0xFFFF  # bits of an observable that a sum is made of: centroid and weight
+
+
+class Traces(NamedTuple):
+    """The sums of the voxels estimated last, by share: threads never write the same."""
+
+    slot: NDArray[np.int32]  # (V,) place of a voxel in its share + 1; 0: never had one
+    owner: NDArray[np.int32]  # (S, PLACES) row that the place belongs to
+    number: NDArray[np.uint8]  # (S, PLACES) sums that are kept
+    whole: NDArray[np.bool_]  # (S, PLACES) all that the last estimate asked for are
+    keys: NDArray[np.int32]  # (S, PLACES, MOST_KEPT)
+    sums: NDArray[np.int32]  # (S, PLACES, MOST_KEPT, SUMS)
+    next: NDArray[np.int64]  # (S,) the place that is given away next
+
+
+def make_traces(shares: int) -> Traces:
+    """Room for the sums of shares x PLACES voxels; what is not used takes no memory."""
+    return Traces(
+        np.zeros(0, np.int32),
+        np.zeros((shares, PLACES), np.int32),
+        np.zeros((shares, PLACES), np.uint8),
+        np.zeros((shares, PLACES), np.bool_),
+        np.zeros((shares, PLACES, MOST_KEPT), np.int32),
+        np.zeros((shares, PLACES, MOST_KEPT, SUMS), np.int32),
+        np.zeros(shares, np.int64),
+    )
+
+
+@kernel
+def make_scratch(most_kept):  # type: ignore[no-untyped-def]
+    """What a thread needs to estimate a voxel."""
+    return (
+        np.empty((LISTS, MOST + 16), np.int32),  # 16: columns start on different cache sets
+        np.empty((COLUMNS, MOST + 16), np.int32),  # votes
+        np.zeros(SUMS, np.int64),  # what was asked for
+        np.zeros(most_kept, np.int64),  # keys of the sums at hand
+        np.zeros((most_kept, SUMS), np.int64),  # these
+        np.zeros(5, np.int64),  # KNOWN .. WHOLE
+        np.zeros((5, MOST_CHANGES), np.int64),  # dirty voxels round a block: x, y, z from its
+        # corner, observable before and now
+    )
+
+
+@kernel(allocates=False)
+def slab_key(r, kind, nx, ny, nz):  # type: ignore[no-untyped-def]
+    """The key of the votes within r and in the slab of a voxel across a normal. The key of a whole
+    cube is r."""
+    ix = np.int64(np.floor(nx * SLAB_UNIT + 0.5)) + SLAB_UNIT
+    iy = np.int64(np.floor(ny * SLAB_UNIT + 0.5)) + SLAB_UNIT
+    iz = np.int64(np.floor(nz * SLAB_UNIT + 0.5)) + SLAB_UNIT
+    return r | (kind << 5) | (ix << 7) | (iy << 15) | (iz << 23)
+
+
+@kernel(allocates=False)
+def _read_key(key):  # type: ignore[no-untyped-def]
+    """(radius, kind, normal times SLAB_UNIT)."""
+    ix, iy, iz = (key >> 7) & 255, (key >> 15) & 255, key >> 23
+    return key & 31, (key >> 5) & 3, ix - SLAB_UNIT, iy - SLAB_UNIT, iz - SLAB_UNIT
+
+
+@kernel(allocates=False)
+def list_votes(at, reach, scratch):  # type: ignore[no-untyped-def]
+    """List the votes within reach. Whether the halo is wide enough."""
+    halo, margin, local, seen, _ = at
+    lists, votes, state = scratch[0], scratch[1], scratch[5]
+    if state[LISTED] >= reach:
+        return True
+    if reach > margin:
+        return False
+    x, y, z = local & 7, (local >> 3) & 7, local >> 6
+    count = take(halo, margin, x, y, z, reach, MOST, seen >> 32 != 0, lists)
+    decode(lists, count, seen, x + margin, y + margin, z + margin, votes)
+    state[LISTED], state[COUNT] = reach, count
+    return True
+
+
+@kernel(allocates=False)
+def ask(at, key, reach, scratch):  # type: ignore[no-untyped-def]
+    """Bring the sums that a key names to scratch.sums. Whether the halo is wide enough.
+
+    at: halo, its margin, the voxel's place in the block, its observable, rule; reach: the largest
+    radius that was asked for, up to which votes are listed."""
+    _, votes, sums, keys, kept, state, _ = scratch
+    for e in range(state[KNOWN]):
+        if keys[e] == key:
+            state[USED] |= 1 << e
+            for s in range(SUMS):
+                sums[s] = kept[e, s]
+            return True
+    if not list_votes(at, reach, scratch):
+        return False
+    _, _, _, seen, rule = at
+    r, kind, ix, iy, iz = _read_key(key)
+    if kind == CUBE:
+        within(votes, state[COUNT], r, sums)
+    else:
+        own = ix * (seen & 15) + iy * ((seen >> 4) & 15) + iz * ((seen >> 8) & 15)
+        half = rule.slab if kind == SLAB else rule.thin_slab
+        within_slab(votes, state[COUNT], r, ix, iy, iz, own, half, sums)
+    _remember(key, reach, scratch)
+    return True
+
+
+@kernel(allocates=False)
+def _remember(key, reach, scratch):  # type: ignore[no-untyped-def]
+    _, _, sums, keys, kept, state, _ = scratch
+    e = state[KNOWN]
+    if reach > FARTHEST:
+        state[WHOLE] = 0
+        return
+    most = keys.shape[0]
+    if e < most:
+        state[KNOWN] += 1
+    else:
+        e = 0
+        while e < most and (state[USED] >> e) & 1:
+            e += 1
+        if e == most:
+            state[WHOLE] = 0
+            return
+    state[USED] |= 1 << e
+    keys[e] = key
+    for s in range(SUMS):
+        kept[e, s] = sums[s]
+
+
+@kernel(allocates=False)
+def recall(traces, share, row, scratch):  # type: ignore[no-untyped-def]
+    """Bring to hand what is kept of a voxel. Whether that is all that its last estimate asked
+    for."""
+    keys, kept, state = scratch[3], scratch[4], scratch[5]
+    state[KNOWN] = state[USED] = state[LISTED] = 0
+    state[WHOLE] = 1
+    place = traces.slot[row] - 1
+    if place < 0 or traces.owner[share, place] != row:
+        return False
+    state[KNOWN] = traces.number[share, place]
+    for e in range(state[KNOWN]):
+        keys[e] = traces.keys[share, place, e]
+        for s in range(SUMS):
+            kept[e, s] = traces.sums[share, place, e, s]
+    return traces.whole[share, place]
+
+
+@kernel(allocates=False)
+def keep(traces, share, row, used, scratch):  # type: ignore[no-untyped-def]
+    """Keep the sums of a voxel whose bits in `used` are set."""
+    keys, kept, state = scratch[3], scratch[4], scratch[5]
+    place = np.int64(traces.slot[row]) - 1
+    if place < 0 or traces.owner[share, place] != row:
+        place = traces.next[share]
+        traces.next[share] = (place + 1) % traces.owner.shape[1]
+        traces.owner[share, place] = row
+        traces.slot[row] = place + 1
+    number = 0
+    for e in range(state[KNOWN]):
+        if (used >> e) & 1:
+            traces.keys[share, place, number] = keys[e]
+            for s in range(SUMS):
+                traces.sums[share, place, number, s] = kept[e, s]
+            number += 1
+    traces.number[share, place] = number
+    traces.whole[share, place] = state[WHOLE] == 1
+
+
+@kernel(allocates=False)
+def list_changes(blocks, columns, dirty, near, blocks_out, changes):  # type: ignore[no-untyped-def]
+    """List the dirty voxels of the blocks `near`. How many, -1: too many."""
+    rows, before, first, following = dirty
+    width = 2 * blocks_out + 1
+    count = 0
+    for n in range(width * width * width):
+        if near[n] < 0:
+            continue
+        x0 = 8 * (n % width - blocks_out)
+        y0 = 8 * ((n // width) % width - blocks_out)
+        z0 = 8 * (n // (width * width) - blocks_out)
+        d = first[near[n]]
+        while d > 0:
+            if count == MOST_CHANGES:
+                return -1
+            local = np.int64(columns.local[rows[d - 1]])
+            changes[0, count] = x0 + (local & 7)
+            changes[1, count] = y0 + ((local >> 3) & 7)
+            changes[2, count] = z0 + (local >> 6)
+            changes[3, count] = before[d - 1]
+            changes[4, count] = columns.observable[rows[d - 1]]
+            count += 1
+            d = following[d - 1]
+    return count
+
+
+@kernel(allocates=False)
+def amend(num_changes, local, seen, rule, scratch):  # type: ignore[no-untyped-def]
+    """Bring the sums at hand from what the changed voxels were to what they are. Whether any sum is
+    another now."""
+    keys, state, changes = scratch[3], scratch[5], scratch[6]
+    farthest = 0
+    for e in range(state[KNOWN]):
+        farthest = max(farthest, keys[e] & 31)
+    x, y, z = local & 7, (local >> 3) & 7, local >> 6
+    different = False
+    for d in range(num_changes):
+        dx, dy, dz = changes[0, d] - x, changes[1, d] - y, changes[2, d] - z
+        distance = max(abs(dx), abs(dy), abs(dz))
+        if distance > farthest:
+            continue
+        before, now = changes[3, d], changes[4, d]
+        for e in range(state[KNOWN]):
+            if keys[e] & 31 < distance:
+                continue
+            was = _counts(dx, dy, dz, before, keys[e], seen, rule)
+            counts = _counts(dx, dy, dz, now, keys[e], seen, rule)
+            if was and counts and (before ^ now) & _VOTE == 0:
+                continue
+            if was:
+                _add_vote(dx, dy, dz, before, -1, e, scratch)
+            if counts:
+                _add_vote(dx, dy, dz, now, 1, e, scratch)
+            different |= was or counts
+    return different
+
+
+@kernel(allocates=False)
+def _counts(dx, dy, dz, word, key, seen, rule):  # type: ignore[no-untyped-def]
+    """Whether a vote at (dx, dy, dz) counts for a sum, if it is near enough."""
+    if word == 0:
+        return False
+    _, kind, ix, iy, iz = _read_key(key)
+    if kind == CUBE:
+        return is_beside(seen, word)
+    x = 8 * dx + (word & 15) - (seen & 15)
+    y = 8 * dy + ((word >> 4) & 15) - ((seen >> 4) & 15)
+    z = 8 * dz + ((word >> 8) & 15) - ((seen >> 8) & 15)
+    vx, vy, vz = ((word >> 16) & 31) - 8, ((word >> 21) & 31) - 8, ((word >> 26) & 31) - 8
+    half = rule.slab if kind == SLAB else rule.thin_slab
+    return abs(ix * x + iy * y + iz * z) <= half and ix * vx + iy * vy + iz * vz > 0
+
+
+@kernel(allocates=False)
+def _add_vote(dx, dy, dz, word, sign, e, scratch):  # type: ignore[no-untyped-def]
+    """Add a vote to one of the sums at hand, or take it out."""
+    kept = scratch[4]
+    x, y, z = 8 * dx + (word & 15), 8 * dy + ((word >> 4) & 15), 8 * dz + ((word >> 8) & 15)
+    w = sign * ((word >> 12) & 15)
+    kept[e, 0] += sign
+    kept[e, 1] += w
+    kept[e, 2] += w * x
+    kept[e, 3] += w * y
+    kept[e, 4] += w * z
+    kept[e, 5] += w * x * x
+    kept[e, 6] += w * x * y
+    kept[e, 7] += w * x * z
+    kept[e, 8] += w * y * y
+    kept[e, 9] += w * y * z
+    kept[e, 10] += w * z * z
