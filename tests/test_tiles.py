@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 
 from facet.mapping.blocks import pack, pack_all, unpack
 from facet.mapping.runs import starts_of
-from facet.mapping.tiles import edges_of, spread, tile_keys_of
+from facet.mapping.tile import edges_of
+from facet.mapping.tiles import spread, tile_keys_of
 from mapping_logs import cloud, log, mapped, wall
 
 index = st.integers(-9000, 9000)

@@ -16,7 +16,7 @@ from facet.mapping.rings import Outline, surfaces_of
 from facet.mapping.runs import deal, starts_of
 from facet.mapping.settings import STEPS, MapSettings
 from facet.mapping.store import VoxelStore, centroid
-from facet.mapping.tiles import Tile
+from facet.mapping.tile import Tile
 from facet_protocol.messages import PlaneFrame
 
 UnitNormal = tuple[int, int, int]

@@ -125,15 +125,17 @@ def _pairs(blocks, patches, plane_of_patch, tile_key, which, out):  # type: igno
                 continue
             x, y, z = i + n % 3 - 1, j + (n // 3) % 3 - 1, k + n // 9 - 1
             other_key = pack(x >> 3, y >> 3, z >> 3)
-            if other_key < tile_key:
-                continue
+            if other_key < tile_key or (other_key == tile_key and n < CENTRE):
+                continue  # found from the other side
             place = ((x >> 3) - ti + 1) + 3 * ((y >> 3) - tj + 1) + 9 * ((z >> 3) - tk + 1)
             for p in range(patches.number[block]):
                 for o in range(patches.number[other]):
                     a = np.int64(plane_of_patch[block, p])
                     b = np.int64(plane_of_patch[other, o])
-                    if other_key == tile_key and a >= b:
-                        continue
+                    if other_key == tile_key:
+                        a, b = min(a, b), max(a, b)
+                        if a == b:
+                            continue
                     pair = (a << 32) | (place << 16) | b
                     if pair == last:
                         continue
