@@ -13,15 +13,16 @@ from numba import prange
 from numpy.typing import NDArray
 
 from facet.mapping.bits import population, trailing_zeros
-from facet.mapping.blocks import CENTRE, find, pack, row_at, unpack
+from facet.mapping.blocks import CENTRE, row_at, unpack
 from facet.mapping.kernel import kernel
 
 SHELL = 1000  # places of blocks in a tile and in the shell round it
 VOXELS = 512  # of a block
 PURE, MIXED, CLAIMED = range(3)  # what a member is to its tile-plane
 COLLECT, LOOK, MOVED, TOUCHED = 1, 2, 4, 8  # flags of a block: labels, or tile-planes of patches,
-# changed; borders or claims; centroids; sums of points
-NEW = -1  # a run that was not there before
+# changed; borders, claims or centroids; centroids; sums of points
+NEW = -1  # a run that was not there before; below: OTHER - r, the run r with other members
+OTHER = -2
 
 
 class Runs(NamedTuple):
@@ -44,7 +45,7 @@ class Held(NamedTuple):
     size: NDArray[np.int16]
     margin: NDArray[np.float32]
     start: NDArray[np.int64]  # (R,) where the rows of each run begin
-    old: NDArray[np.int64]  # (R,) the run that each was before, NEW: none
+    old: NDArray[np.int64]  # (R,) the run that each was before, NEW: none, or OTHER
     first: NDArray[np.int64]  # (N,) first run of each tile
     last: NDArray[np.int64]  # (N,) the run behind its last
 
@@ -100,29 +101,38 @@ def _collect(blocks, patches, plane_of_patch, tile_key, block, members):  # type
 
 
 @kernel
-def _shell(blocks, tile_key, out):  # type: ignore[no-untyped-def]
-    """Blocks of a tile and of the one-block shell round it into out (SHELL,), by ascending key,
-    -1 where there is none. Returns how many members they can have."""
+def _shell(blocks, flags, tile_key, members, near):  # type: ignore[no-untyped-def]
+    """Blocks of a tile, `members`, and those round them into near (SHELL,), by ascending key, -1
+    where there is none. Returns how many members can be in those that are flagged."""
     ti, tj, tk = unpack(tile_key)
-    place, room = 0, np.int64(0)
-    for i in range(8 * ti - 1, 8 * ti + 9):
-        for j in range(8 * tj - 1, 8 * tj + 9):
-            for k in range(8 * tk - 1, 8 * tk + 9):
-                block = find(blocks.table_keys, blocks.table_values, pack(i, j, k))
-                out[place] = block
-                place += 1
-                if block >= 0:
-                    for z in range(8):
-                        room += 2 * np.int64(population(blocks.occupied[block, z]))
+    near[:] = -1
+    for q in range(members.shape[0]):
+        block = members[q]
+        i, j, k = unpack(blocks.keys[block])
+        x, y, z = i - 8 * ti, j - 8 * tj, k - 8 * tk
+        place = 100 * (x + 1) + 10 * (y + 1) + z + 1
+        near[place] = block
+        if 0 < x < 7 and 0 < y < 7 and 0 < z < 7:
+            continue
+        for n in range(27):
+            if n != CENTRE and blocks.neighbours[block, n] >= 0:
+                at = place + 100 * (n % 3 - 1) + 10 * (n // 3 % 3 - 1) + n // 9 - 1
+                near[at] = blocks.neighbours[block, n]
+    room = np.int64(0)
+    for place in range(SHELL):
+        if near[place] >= 0 and flags[near[place]] & COLLECT:
+            for z in range(8):
+                room += 2 * np.int64(population(blocks.occupied[near[place], z]))
     return room
 
 
-@kernel(parallel=True)
-def find_shells(blocks, tile_keys, near, room):  # type: ignore[no-untyped-def]
-    """For each tile the blocks that may hold its members, near (N, SHELL), and room (N,): as many
-    members as there can be."""
-    for n in prange(tile_keys.shape[0]):
-        room[n] = _shell(blocks, tile_keys[n], near[n])
+@kernel
+def find_shells(blocks, flags, tile_keys, members, member_starts, near, room):  # type: ignore[no-untyped-def]
+    """For each tile, whose blocks begin at members[member_starts[n]], the blocks that may hold its
+    members, near (N, SHELL), and room (N,): as many as there can be in flagged ones."""
+    for n in range(tile_keys.shape[0]):
+        which = members[member_starts[n] : member_starts[n + 1]]
+        room[n] = _shell(blocks, flags, tile_keys[n], which, near[n])
 
 
 @kernel
@@ -240,13 +250,16 @@ def _same_run(before, r, listed, run):  # type: ignore[no-untyped-def]
 
 @kernel
 def _recognise(before, place, chain, into, listed, begin, num, counts):  # type: ignore[no-untyped-def]
-    """Find which runs of a block, listed from `begin` to `num`, are not new."""
+    """Find what runs of a block, listed from `begin` to `num`, were before."""
     for run in range(begin, num):
         plane = listed.plane[run]
         r = chain.head[place]
         while r >= 0:
-            if into[before.plane[r]] == plane and _same_run(before, r, listed, run):
-                _take_over(before, r, plane, chain, listed, run, counts)
+            if into[before.plane[r]] == plane:
+                if _same_run(before, r, listed, run):
+                    _take_over(before, r, plane, chain, listed, run, counts)
+                else:
+                    listed.old[run] = OTHER - r
                 break
             r = chain.link[r - chain.first]
 
@@ -263,7 +276,7 @@ def _inherit(before, place, chain, local, listed, begin, num, was, counts):  # t
                     was[local[before.rows[m]]] = before.plane[r] + 1
         r = chain.link[r - chain.first]
     for run in range(begin, num):
-        if listed.old[run] == NEW:
+        if listed.old[run] <= NEW:
             for m in range(listed.start[run], listed.start[run] + listed.size[run]):
                 old = was[local[listed.rows[m]]]
                 if old > 0 and listed.state[m] != CLAIMED:
@@ -318,7 +331,7 @@ def _sort(listed, num, num_planes, before, held, n):  # type: ignore[no-untyped-
         r, start = first + num_runs[t], first + num_rows[t]
         held.block[r], held.plane[r], held.size[r] = listed.block[run], t, size
         held.start[r], held.old[r] = start, listed.old[run]
-        if listed.old[run] == NEW:
+        if listed.old[run] <= NEW:
             for m in range(size):
                 held.rows[start + m] = listed.rows[at + m]
                 held.state[start + m] = listed.state[at + m]

@@ -59,7 +59,10 @@ class Renewal:
         counts = np.zeros(table[-1, 2], np.int64)
         all_into = np.concatenate(became)
         near, room = np.empty((len(tiles), SHELL), np.int32), np.empty(len(tiles), np.int64)
-        find_shells(blocks, tile_keys, near, room)
+        members = np.concatenate([tile.blocks for tile in tiles])
+        ends = starts_of([len(tile.blocks) for tile in tiles])
+        find_shells(blocks, flags, tile_keys, members, ends, near, room)
+        room += [len(tile.rows) for tile in tiles]
         before, held = _held(tiles), _room(room)
         parts = deal(starts_of(room))
         gather_members(
@@ -82,7 +85,7 @@ class Renewal:
             if tile.key in changed:
                 own = counts[table[n, 2] : table[n + 1, 2]].reshape(old[n], new[n])
                 _bequeath(tile, own)
-            _give(tile, held, n, stamps[low:high], Tally(*(c[low:high].copy() for c in tally)))
+            _give(tile, held, n, stamps, tally, slice(low, high))
 
     def _tell(
         self, touched: Touched, capacity: int
@@ -123,10 +126,11 @@ def _room(room: NDArray[np.int64]) -> Held:
     """Room for the members of tiles, as many as there can be (N,)."""
     ends = starts_of(room)
     size = int(ends[-1])
-    kinds = (
-        np.int32, np.int8, np.int32, np.int16, np.int16, np.float32, np.int64, np.int64,
+    return Held(
+        np.empty(size, np.int32), np.empty(size, np.int8), np.empty(size, np.int32),
+        np.empty(size, np.int16), np.empty(size, np.int16), np.empty(size, np.float32),
+        np.empty(size, np.int64), np.empty(size, np.int64), ends[:-1].copy(), ends[1:].copy(),
     )  # fmt: skip
-    return Held(*(np.empty(size, kind) for kind in kinds), ends[:-1].copy(), ends[1:].copy())
 
 
 def _tallied(tiles: list[Tile]) -> Tally:
@@ -150,11 +154,18 @@ def _bequeath(tile: Tile, counts: NDArray[np.int64]) -> None:
         tile.ids = np.zeros(0, np.int64)  # nobody will name it
 
 
-def _give(tile: Tile, held: Held, n: int, stamps: NDArray[np.int64], tally: Tally) -> None:
-    """Give a tile what was found of it."""
-    first = int(held.first[n])
-    tile.runs = Runs(*(getattr(held, name)[first : held.last[n]].copy() for name in Runs._fields))
+def _give(
+    tile: Tile, held: Held, n: int, stamps: NDArray[np.int64], tally: Tally, own: slice
+) -> None:
+    """Give a tile what was found of it and of its `own` tile-planes."""
+    first, last = int(held.first[n]), int(held.last[n])
+    runs = slice(first, last)
+    tile.runs = Runs(
+        held.block[runs].copy(), held.plane[runs].copy(), held.size[runs].copy(),
+        held.margin[runs].copy(),
+    )  # fmt: skip
     end = first + int(tile.runs.size.sum())
     tile.rows, tile.state = held.rows[first:end].copy(), held.state[first:end].copy()
-    tile.stamps = stamps.copy()
-    tile.points, tile.total, tile.occupation, tile.facing, tile.planes = tally
+    tile.stamps, tile.points = stamps[own].copy(), tally.points[own].copy()
+    tile.total, tile.occupation = tally.total[own].copy(), tally.occupation[own].copy()
+    tile.facing, tile.planes = tally.facing[own].copy(), tally.planes[own].copy()

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from facet.mapping.blocks import unpack
 from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
-from facet.mapping.membership import CLAIMED, LOOK, MIXED, MOVED, NEW, PURE, TOUCHED
+from facet.mapping.membership import CLAIMED, LOOK, MIXED, MOVED, NEW, OTHER, PURE, TOUCHED
 from facet.mapping.merging import plane_of
 from facet.mapping.settings import BLOCK, STEPS, TILE
-from facet.mapping.store import centroid
 from facet.mapping.sums import SUMS, count_points, read_sums, shift_moments
 
 STRAY = 0.47  # voxels: a voxel whose centroid is so far off its tile-plane is not fitted to
@@ -49,23 +48,41 @@ def _seen_from(nodes, t, tile_key, out):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _settled(sources, rows, state, tile_key, plane):  # type: ignore[no-untyped-def]
-    """The plane moved to where most of the members' centroids lie. A rim that tilts it, or another
-    surface close by, is left behind."""
+def _sound(sources, held, span, tile_key):  # type: ignore[no-untyped-def]
+    """(N, 3) centroids of the members of runs that hold no points of others, from the corner of the
+    tile, 1/8 voxels."""
     blocks, columns, border, second = sources
-    ti, tj, tk = unpack(tile_key)
+    start, stop = _rows_of(held, span)
+    out = np.empty((stop - start, 3), np.int32)
+    count = 0
+    for r in range(span[0], span[1]):
+        corner = _corner(blocks, held.block[r], tile_key)
+        for m in range(held.start[r], held.start[r] + held.size[r]):
+            row = held.rows[m]
+            if held.state[m] == CLAIMED or border[row] or second[row] >= 0:
+                continue
+            local, seen = np.int64(columns.local[row]), columns.observable[row]
+            out[count, 0] = STEPS * (corner[0] + (local & 7)) + (seen & 15)
+            out[count, 1] = STEPS * (corner[1] + ((local >> 3) & 7)) + ((seen >> 4) & 15)
+            out[count, 2] = STEPS * (corner[2] + (local >> 6)) + ((seen >> 8) & 15)
+            count += 1
+    return out[:count]
+
+
+@kernel
+def _settled(centroids, plane):  # type: ignore[no-untyped-def]
+    """The plane (4,) moved to where most of the centroids (N, 3) lie. A rim that tilts it, or
+    another surface close by, is left behind."""
     spread = np.empty(6)
+    pure = centroids.shape[0]
     for _ in range(ROUNDS):
         nx, ny, nz, offset = plane
-        n, pure = 0, 0
+        n = 0
         x, y, z, xx, xy, xz, yy, yz, zz = 0, 0, 0, 0, 0, 0, 0, 0, 0
-        for m in range(rows.shape[0]):
-            row = rows[m]
-            if state[m] == CLAIMED or border[row] or second[row] >= 0:
-                continue
-            a, b, c = centroid(blocks, columns, row)
-            a, b, c = a - STEPS * TILE * ti, b - STEPS * TILE * tj, c - STEPS * TILE * tk
-            pure += 1
+        for m in range(pure):
+            a, b, c = (
+                np.int64(centroids[m, 0]), np.int64(centroids[m, 1]), np.int64(centroids[m, 2]),
+            )  # fmt: skip
             if abs((nx * a + ny * b + nz * c) / STEPS - offset) > CORE:
                 continue
             n, x, y, z = n + 1, x + a, y + b, z + c
@@ -150,20 +167,55 @@ def _look(sources, held, r, corner, plane, tally, t, sums, fresh):  # type: igno
 
 
 @kernel
-def _count(sources, held, r, tally, t, sign, sums):  # type: ignore[no-untyped-def]
-    """Add the points of a run's members, times the sign, to the total."""
+def _count(sources, held, r, tally, t, sums):  # type: ignore[no-untyped-def]
+    """Add the points of a run's members to the total."""
     for m in range(held.start[r], held.start[r] + held.size[r]):
         if held.state[m] != CLAIMED:
-            _change(sources, held.rows[m], (0, 0, 0), sign, False, tally, t, sums)
+            _change(sources, held.rows[m], (0, 0, 0), 1, False, tally, t, sums)
 
 
 @kernel
 def _drop(sources, before, r, corner, tally, t, sums):  # type: ignore[no-untyped-def]
-    """Take the PURE points of a run that is no more out of its tile-plane."""
+    """Take the points of a run that is no more out of its tile-plane."""
     for m in range(before.start[r], before.start[r] + before.size[r]):
-        if before.state[m] == PURE:
-            _change(sources, before.rows[m], corner, -1, True, tally, t, sums)
-    _count(sources, before, r, tally, t, -1, sums)
+        _leave(sources, before, m, corner, tally, t, sums)
+
+
+@kernel
+def _leave(sources, before, m, corner, tally, t, sums):  # type: ignore[no-untyped-def]
+    """Take the points of a member out of its tile-plane."""
+    if before.state[m] == PURE:
+        _change(sources, before.rows[m], corner, -1, True, tally, t, sums)
+    if before.state[m] != CLAIMED:
+        _change(sources, before.rows[m], corner, -1, False, tally, t, sums)
+
+
+@kernel
+def _merge(sources, before, old, held, r, corner, tally, t, sums):  # type: ignore[no-untyped-def]
+    """Take out of a tile-plane what a run lost against its old one, and count what it won, which is
+    not PURE yet. Both have their members in order of their places in the block."""
+    local = sources[1].local
+    m, stop = before.start[old], before.start[old] + before.size[old]
+    for at in range(held.start[r], held.start[r] + held.size[r]):
+        key = _key(local, held, at)
+        while m < stop and _key(local, before, m) < key:
+            _leave(sources, before, m, corner, tally, t, sums)
+            m += 1
+        if m < stop and _key(local, before, m) == key:
+            held.state[at] = before.state[m]
+            m += 1
+        elif held.state[at] != CLAIMED:
+            held.state[at] = MIXED
+            _change(sources, held.rows[at], corner, 1, False, tally, t, sums)
+    while m < stop:
+        _leave(sources, before, m, corner, tally, t, sums)
+        m += 1
+
+
+@kernel
+def _key(local, held, m):  # type: ignore[no-untyped-def]
+    """By which the members of a run are in order."""
+    return 2 * np.int64(local[held.rows[m]]) + (held.state[m] == CLAIMED)
 
 
 @kernel
@@ -199,7 +251,8 @@ def _begin(sources, flags, tile_key, before, span, held, own, into, news, anew, 
     stays = np.zeros(span[3] - span[2], np.bool_)
     for r in range(own[2], own[3]):
         if held.old[r] != NEW:
-            stays[held.old[r] - span[2]] = True
+            known = held.old[r] if held.old[r] >= 0 else OTHER - held.old[r]
+            stays[known - span[2]] = True
     sums = np.empty(SUMS, np.int64)
     for r in range(span[2], span[3]):
         o = first + before.plane[r]
@@ -218,49 +271,50 @@ def _begin(sources, flags, tile_key, before, span, held, own, into, news, anew, 
 
 
 @kernel
-def _finish(sources, flags, nodes, tile_key, held, span, t, o, lost, anew, old, tally):  # type: ignore[no-untyped-def]
+def _finish(  # type: ignore[no-untyped-def]
+    sources, flags, nodes, tile_key, before, held, span, t, o, lost, anew, old, tally
+):
     """Bring the sums of a tile-plane up to date, which was o, -1: nothing, and has the runs `span`.
     Returns whether it holds the same voxels at the same places."""
     same, stirred = o >= 0 and not lost, o < 0 or lost
     for r in range(span[0], span[1]):
         flag = flags[held.block[r]]
-        stirred |= held.old[r] == NEW or flag & LOOK != 0
-        same &= held.old[r] != NEW and flag & MOVED == 0
-    _seen_from(nodes, t, tile_key, tally.facing[t])
+        stirred |= held.old[r] <= NEW or flag & LOOK != 0
+        same &= held.old[r] > NEW and flag & MOVED == 0
+    f = tally.facing[t]
+    _seen_from(nodes, t, tile_key, f)
     still = not stirred
     for a in range(5 * still):
-        still &= tally.facing[t, a] == old.facing[o, a]
-    start, stop = _rows_of(held, span)
+        still &= f[a] == old.facing[o, a]
+    plane = f[0], f[1], f[2], f[3]
     if still:
-        tally.planes[t] = old.planes[o]
-    else:
-        tally.planes[t] = tally.facing[t, :4]
-        if RIMMED[0] <= tally.facing[t, 4] <= RIMMED[1]:
-            f = tally.facing[t]
-            tally.planes[t, 0], tally.planes[t, 1], tally.planes[t, 2], tally.planes[t, 3] = (
-                _settled(
-                    sources, held.rows[start:stop], held.state[start:stop], tile_key,
-                    (f[0], f[1], f[2], f[3]),
-                )
-            )  # fmt: skip
+        plane = old.planes[o, 0], old.planes[o, 1], old.planes[o, 2], old.planes[o, 3]
+    elif RIMMED[0] <= f[4] <= RIMMED[1]:
+        plane = _settled(_sound(sources, held, span, tile_key), plane)
+    tally.planes[t, 0], tally.planes[t, 1], tally.planes[t, 2], tally.planes[t, 3] = plane
     moved = o < 0
     for a in range(4 * (not moved)):
         moved |= tally.planes[t, a] != old.planes[o, a]
     sums = np.empty(SUMS, np.int64)
-    plane = tally.planes[t, 0], tally.planes[t, 1], tally.planes[t, 2], tally.planes[t, 3]
     for r in range(span[0], span[1]):
         corner = _corner(sources[0], held.block[r], tile_key)
         fresh = held.old[r] == NEW or anew
-        look = fresh or flags[held.block[r]] & LOOK != 0
+        other = held.old[r] <= OTHER and not fresh
+        if other:
+            _merge(sources, before, OTHER - held.old[r], held, r, corner, tally, t, sums)
+        look = fresh or other or flags[held.block[r]] & LOOK != 0
         if moved and not look:
             held.margin[r] -= np.float32(_drift(corner, old.planes[o], plane) + SLACK)
             look = held.margin[r] <= 0.0
         if look:
             _look(sources, held, r, corner, plane, tally, t, sums, fresh)
         if fresh:
-            _count(sources, held, r, tally, t, 1, sums)
+            _count(sources, held, r, tally, t, sums)
+    start, stop = _rows_of(held, span)
+    occupation = 0
     for m in range(start, stop):
-        tally.occupation[t] += held.state[m] != CLAIMED
+        occupation += held.state[m] != CLAIMED
+    tally.occupation[t] = occupation
     return same
 
 
@@ -306,6 +360,6 @@ def tally_points(  # type: ignore[no-untyped-def]
                     r += 1
                 was[t] = known[t - first]
                 same[t] = _finish(
-                    sources, flags, nodes, tile_keys[n], held, (begin, r), t, was[t],
+                    sources, flags, nodes, tile_keys[n], before, held, (begin, r), t, was[t],
                     lost[t - first], anew, old, tally,
                 )  # fmt: skip

@@ -56,29 +56,26 @@ class Tile:
         return starts_of(np.bincount(self.runs.plane, self.runs.size, self.num_planes))
 
     @property
+    def run_starts(self) -> NDArray[np.int64]:
+        """(T + 1,) where the runs of each tile-plane begin."""
+        return starts_of(np.bincount(self.runs.plane, minlength=self.num_planes))
+
+    @property
     def corner(self) -> NDArray[np.bool_]:
         """(M,) which rows are only claimed."""
         return np.asarray(self.state == CLAIMED)
 
-    def rows_of(self, plane: int) -> NDArray[np.int32]:
-        """Voxel rows of one of its tile-planes, a view."""
-        return self.rows[self._part(plane)]
-
     def members_of(self, plane: int) -> NDArray[np.int32]:
-        """Those of them that belong to no other, a copy."""
-        part = self._part(plane)
-        return self.rows[part][self.state[part] != CLAIMED]
+        """Rows of one of its tile-planes that belong to no other, a copy."""
+        low, high = np.searchsorted(self.runs.plane, (plane, plane + 1)).tolist()
+        start = int(self.runs.size[:low].sum())
+        part = slice(start, start + int(self.runs.size[low:high].sum()))
+        return np.compress(self.state[part] != CLAIMED, self.rows[part])
 
     @property
     def owner(self) -> NDArray[np.int64]:
         """(M,) tile-plane of each row."""
         return np.repeat(np.arange(self.num_planes), np.diff(self.starts))
-
-    def _part(self, plane: int) -> slice:
-        low, high = np.searchsorted(self.runs.plane, (plane, plane + 1))
-        sizes = self.runs.size
-        start = int(sizes[:low].sum())
-        return slice(start, start + int(sizes[low:high].sum()))
 
 
 def edges_of(tiles: list[Tile], starts: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -95,7 +92,8 @@ def edges_of(tiles: list[Tile], starts: NDArray[np.int64]) -> NDArray[np.int64]:
 def empty_tile(key: int, blocks: NDArray[np.int32]) -> Tile:
     """A tile without tile-planes."""
     nodes = Nodes(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 6)), np.zeros((0, 3)))
-    runs = Runs(*(np.zeros(0, kind) for kind in (np.int32, np.int16, np.int16, np.float32)))
+    none = np.zeros(0, np.int16)
+    runs = Runs(np.zeros(0, np.int32), none, none, np.zeros(0, np.float32))
     return Tile(
         key, blocks, nodes, np.zeros((0, MOMENTS), np.int64), np.zeros(0, np.int64),
         np.zeros(0, np.int64), np.zeros((0, 5)), np.zeros((0, 4)), np.zeros(0, np.int64),

@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from facet.mapping.blocks import pack, pack_all, unpack, unpack_all
+from facet.mapping.blocks import pack, unpack
 from facet.mapping.growth import grow_tiles, pair_tiles
 from facet.mapping.kernel import kernel
 from facet.mapping.membership import COLLECT, LOOK, MOVED, TOUCHED, follow_planes, list_abroad
@@ -36,14 +36,25 @@ def tile_keys_of(block_keys):  # type: ignore[no-untyped-def]
     return out
 
 
+@kernel
+def _tiles_near(block_keys, out):  # type: ignore[no-untyped-def]
+    """Keys of tiles that hold one of the blocks (B,) or a 26-neighbour of one, again and again,
+    into out (8 B,). How many."""
+    count = 0
+    for b in range(block_keys.shape[0]):
+        i, j, k = unpack(block_keys[b])
+        for x in range((i - 1) >> 3, ((i + 1) >> 3) + 1):  # a tile is 8 blocks wide
+            for y in range((j - 1) >> 3, ((j + 1) >> 3) + 1):
+                for z in range((k - 1) >> 3, ((k + 1) >> 3) + 1):
+                    out[count] = pack(x, y, z)
+                    count += 1
+    return count
+
+
 def spread(tile_keys: NDArray[np.int64], block_keys: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Tiles that hold one of the blocks or a 26-neighbour of one, ascending."""
-    if not len(block_keys):
-        return tile_keys
-    ijk = unpack_all(block_keys)
-    corners = np.stack(np.meshgrid(*[[-1, 1]] * 3, indexing="ij"), -1).reshape(-1, 3)
-    near = pack_all((ijk[:, None, :] + corners).reshape(-1, 3) >> 3)  # a tile is 8 blocks wide
-    return np.union1d(tile_keys, near)
+    """The tiles, and those that hold one of the blocks or a 26-neighbour of one, ascending."""
+    near = np.empty(8 * len(block_keys), np.int64)
+    return np.union1d(tile_keys, near[: _tiles_near(block_keys, near)])
 
 
 class TileField:
@@ -199,7 +210,7 @@ class TileField:
         """Find which tile-planes of tiles touch others."""
         members, member_starts = self._members(keys)
         tile_keys, counts = np.array(keys, np.int64), np.empty(len(keys), np.int64)
-        room = 4096
+        room = 1 << 14
         while True:
             pairs = np.empty((len(keys), room), np.int64)
             pair_tiles(
@@ -225,5 +236,5 @@ def _flag(
     flags[store.columns.block[touched.rows]] |= TOUCHED
     flags[turned] |= LOOK
     flags[relabelled] |= COLLECT | LOOK
-    flags[moved] |= COLLECT | LOOK | MOVED
+    flags[moved] |= LOOK | MOVED
     return flags
