@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
-from facet.mapping.contours import SIZE
+from facet.mapping.cells import SIZE
 from facet.mapping.pivot import CELLS, HALO, boundary_edges
 from facet.mapping.settings import ALPHA2
 

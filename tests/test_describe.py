@@ -9,7 +9,7 @@ import pytest
 
 from facet.mapping.contours import Contour, make_frame
 from facet.mapping.describe import Describer, Figures
-from facet.mapping.fitting import fit_plane
+from facet.mapping.fitting import fit_planes
 from facet.mapping.freespace import FreeSpace
 from facet.mapping.rings import Outline
 from facet.mapping.settings import MapSettings
@@ -21,7 +21,8 @@ SCATTER = np.array([0.001, 0.0, 0.0, 30.0, 0.0, 20.0])
 
 def figures(x: float = 2.0, sighting: Sighting | None = None, voxels: int = 70) -> Figures:
     centroid = np.array([x, 1.0, 1.0])
-    fit = fit_plane(100, centroid, SCATTER, np.array([-1.0, 0.0, 0.0]), SETTINGS.tick_m)
+    weight, side = np.array([100.0]), np.array([[-1.0, 0.0, 0.0]])
+    (fit,) = fit_planes(weight, centroid[None], SCATTER[None], side, SETTINGS.tick_m)
     return Figures(fit, 100, voxels, centroid, sighting or Sighting(1, 2, {"r"}))
 
 

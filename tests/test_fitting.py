@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from facet.mapping.eigen import eigenvalues
-from facet.mapping.fitting import Fit, fit_plane
+from facet.mapping.fitting import Fit, fit_planes
 from facet_protocol.messages import PlaneClass
 
 TICK = 0.05 / 1024
@@ -20,7 +20,8 @@ def fit(points: NDArray[np.float64], seen_from: object) -> Fit:
     """The fit of points (N, 3) m seen from the side of `seen_from` (3,)."""
     mean = points.mean(0)
     scatter = ((points - mean).T @ (points - mean))[UPPER]
-    return fit_plane(len(points), mean, scatter, np.asarray(seen_from, float), TICK)
+    side = np.asarray(seen_from, float)
+    return fit_planes(np.array([len(points)]), mean[None], scatter[None], side[None], TICK)[0]
 
 
 def patch(
@@ -80,7 +81,8 @@ def test_near_the_origin_the_inside_sign_stays(shift: float) -> None:
 def test_the_thickness_angle_of_method_10_2() -> None:
     n = 50
     scatter = np.array([1.0, 0.0, 0.0, 1.0, 0.0, 0.01]) * n
-    found = fit_plane(n, np.array([0.0, 0.0, 3.0]), scatter, np.array([0.0, 0.0, 1.0]), TICK)
+    centroid, side = np.array([[0.0, 0.0, 3.0]]), np.array([[0.0, 0.0, 1.0]])
+    (found,) = fit_planes(np.array([n]), centroid, scatter[None], side, TICK)
     assert found.thickness_angle_deg == pytest.approx(6.5868, abs=5e-5)
     s1, s2, s3 = np.sqrt(np.array(eigenvalues(1.0, 1.0, 0.01, 0.0, 0.0, 0.0)))
     assert (s2 / s3) / (s1 / s2) == pytest.approx(10.0)  # lambda, eq. 18

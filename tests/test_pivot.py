@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from alpha_oracle import boundary, regular, scattered, tiled, window_of
-from facet.mapping.contours import SIZE
+from facet.mapping.cells import SIZE
 from facet.mapping.pivot import boundary_edges
 from facet.mapping.settings import ALPHA2
 

@@ -7,8 +7,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from facet.mapping.blocks import pack, pack_all, unpack
+from facet.mapping.mapper import Mapper
 from facet.mapping.runs import starts_of
-from facet.mapping.tiles import edges_of, spread, tile_keys_of
+from facet.mapping.tile import edges_of
+from facet.mapping.tiles import spread, tile_keys_of
 from mapping_logs import cloud, log, mapped, wall
 
 index = st.integers(-9000, 9000)
@@ -84,3 +86,28 @@ def test_adjacent_tile_planes_are_listed_once() -> None:
     for one, other in tile_of[edges].tolist():
         gap = np.abs(np.subtract(unpack(held[other].key), unpack(held[one].key)))
         assert gap.max() <= 1
+
+
+def stamped(mapper: Mapper) -> dict[int, bytes]:
+    """The voxels of all tile-planes and their centroids, by stamp."""
+    told, seen = dict[int, bytes](), mapper._store.columns.observable
+    for tile in mapper._tiles.tiles.values():
+        for stamp, low, high in zip(tile.stamps, tile.starts, tile.starts[1:], strict=False):
+            own = tile.rows[low:high], seen[tile.rows[low:high]], tile.corner[low:high]
+            told[int(stamp)] = b"".join(column.tobytes() for column in own)
+    return told
+
+
+def test_a_stamp_stays_with_the_same_voxels_alone() -> None:
+    whole = log("room-depth")
+    mapper = mapped(whole.scans[:8], whole.settings)
+    kept = 0
+    for scan in whole.scans[8:]:
+        before = stamped(mapper)
+        mapper.insert(scan)
+        mapper.update()
+        after = stamped(mapper)
+        assert len(after) == sum(tile.num_planes for tile in mapper._tiles.tiles.values())
+        assert all(before.get(stamp, held) == held for stamp, held in after.items())
+        kept += len(before.keys() & after.keys())
+    assert kept > 0

@@ -30,37 +30,46 @@ class Fit(NamedTuple):
     plane_class: PlaneClass
 
 
-def fit_plane(
-    weight: float,
+def fit_planes(
+    weight: NDArray[np.float64],
     centroid: NDArray[np.float64],
     scatter: NDArray[np.float64],
     mean_normal: NDArray[np.float64],
     tick_m: float,
-) -> Fit:
-    """Fit through `weight` points with `centroid` (3,) m and `scatter` (6,) m^2 about it.
+) -> list[Fit]:
+    """Fits through `weight` (K,) points with `centroid` (K, 3) m and `scatter` (K, 6) m^2 about it.
 
-    `mean_normal` (3,), any length, tells the side it was seen from."""
-    low, nx, ny, nz, middle, high = smallest(scatter)
-    inside = np.array([nx, ny, nz])
-    if float(inside @ mean_normal) < 0.0:
-        inside = -inside
-    offset = float((inside[0] * centroid[0] + inside[1] * centroid[1]) + inside[2] * centroid[2])
-    variances = np.maximum([high, middle, low], 0.0) / weight
+    `mean_normal` (K, 3), any length, tells the side they were seen from."""
+    inside, spreads = np.empty((len(weight), 3)), np.empty((len(weight), 3))
+    for k, own in enumerate(scatter):
+        low, nx, ny, nz, middle, high = smallest(own)
+        inside[k] = nx, ny, nz
+        if float(inside[k] @ mean_normal[k]) < 0.0:
+            inside[k] = -inside[k]
+        spreads[k] = high, middle, low
+    x, y, z = (inside * centroid).T
+    offset = (x + y) + z
+    variances = np.maximum(spreads, 0.0) / weight[:, None]
     flipped = offset < -tick_m  # nearer to the origin than a tick the inside sign stays
-    normal = -inside if flipped else inside
-    tangential = math.sqrt(math.sqrt(max(variances[0] * variances[1], 1e-24)))
-    sigma = math.sqrt(variances[2])
-    return Fit(
-        inside=inside,
-        offset_m=offset,
-        normal=normal,
-        d=abs(offset) if flipped else max(offset, 0.0),
-        facing=-1 if flipped else 1,
-        sigma_n_m=sigma,
-        thickness_angle_deg=math.degrees(math.atan(2.0 * sigma / (math.sqrt(3.0) * tangential))),
-        covariance=_covariance(weight, normal, centroid, scatter, variances),
-        plane_class=_classify(inside),
-    )
+    normal = np.where(flipped[:, None], -inside, inside)
+    tangential = np.sqrt(np.sqrt(np.maximum(variances[:, 0] * variances[:, 1], 1e-24)))
+    sigma = np.sqrt(variances[:, 2])
+    slope = 2.0 * sigma / (math.sqrt(3.0) * tangential)
+    covariance = _covariance(weight, normal, centroid, scatter, variances)
+    return [
+        Fit(
+            inside=inside[k].copy(),
+            offset_m=own,
+            normal=normal[k].copy(),
+            d=abs(own) if flipped[k] else max(own, 0.0),
+            facing=-1 if flipped[k] else 1,
+            sigma_n_m=float(sigma[k]),
+            thickness_angle_deg=math.degrees(math.atan(slope[k])),
+            covariance=covariance[k].copy(),
+            plane_class=_classify(inside[k]),
+        )
+        for k, own in enumerate(offset.tolist())
+    ]
 
 
 def _classify(inside: NDArray[np.float64]) -> PlaneClass:
@@ -70,22 +79,24 @@ def _classify(inside: NDArray[np.float64]) -> PlaneClass:
 
 
 def _covariance(
-    weight: float,
+    weight: NDArray[np.float64],
     normal: NDArray[np.float64],
     centroid: NDArray[np.float64],
     scatter: NDArray[np.float64],
     variances: NDArray[np.float64],
 ) -> NDArray[np.float64]:
-    """Of (normal, d), first order: the normal tilts about the two principal directions in the plane
-    with variance sigma_N^2 / (N sigma_i^2)."""
-    full = scatter[[0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(3, 3) / weight
-    tangent = np.eye(3) - np.outer(normal, normal)
+    """(K, 4, 4) of (normal, d), first order: the normal tilts about the two principal directions in
+    the plane with variance sigma_N^2 / (N sigma_i^2)."""
+    full = scatter[:, [0, 1, 2, 1, 3, 4, 2, 4, 5]].reshape(-1, 3, 3) / weight[:, None, None]
+    tangent = np.eye(3) - normal[:, :, None] * normal[:, None, :]
     spread = tangent @ full @ tangent
-    noise = variances[2] / weight
-    tilt = noise * np.linalg.pinv(spread, rcond=1e-9, hermitian=True)
-    across = -tilt @ centroid  # d = normal . centroid: it moves against the tilt's lever arm
-    covariance = np.empty((4, 4))
-    covariance[:3, :3] = tilt
-    covariance[:3, 3] = covariance[3, :3] = -across
-    covariance[3, 3] = noise + float(centroid @ tilt @ centroid)
+    noise = variances[:, 2] / weight
+    tilt = noise[:, None, None] * np.linalg.pinv(spread, rcond=1e-9, hermitian=True)
+    across = (-tilt @ centroid[:, :, None])[:, :, 0]  # d = normal . centroid: it moves against the
+    # tilt's lever arm
+    covariance = np.empty((len(weight), 4, 4))
+    covariance[:, :3, :3] = tilt
+    covariance[:, :3, 3] = covariance[:, 3, :3] = -across
+    own = centroid[:, None, :] @ tilt @ centroid[:, :, None]
+    covariance[:, 3, 3] = noise + own[:, 0, 0]
     return covariance

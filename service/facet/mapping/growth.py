@@ -11,6 +11,8 @@ from facet.mapping.merging import Nodes, merge_all
 from facet.mapping.normals import UNIT
 from facet.mapping.settings import BLOCK, STEPS
 
+LATELY = 4096
+
 
 @kernel
 def _tile_nodes(block_keys, neighbours, patches, which, tile_key):  # type: ignore[no-untyped-def]
@@ -114,33 +116,35 @@ def _pairs(blocks, patches, plane_of_patch, tile_key, which, out):  # type: igno
     """Adjacent tile-planes, the smaller tile first, as own << 32 | place of the other tile among
     the 27 << 16 | other; with repetitions. How many, or -1 where `out` is too short."""
     count = 0
+    lately = np.full(LATELY, -1, np.int64)  # found not long ago
     ti, tj, tk = unpack(tile_key)
     for q in range(which.shape[0]):
         block = which[q]
         i, j, k = unpack(blocks.keys[block])
-        last = np.int64(-1)
         for n in range(27):
             other = block if n == CENTRE else blocks.neighbours[block, n]
             if other < 0 or patches.number[other] == 0:
                 continue
             x, y, z = i + n % 3 - 1, j + (n // 3) % 3 - 1, k + n // 9 - 1
             other_key = pack(x >> 3, y >> 3, z >> 3)
-            if other_key < tile_key:
-                continue
+            if other_key < tile_key or (other_key == tile_key and n < CENTRE):
+                continue  # found from the other side
             place = ((x >> 3) - ti + 1) + 3 * ((y >> 3) - tj + 1) + 9 * ((z >> 3) - tk + 1)
             for p in range(patches.number[block]):
                 for o in range(patches.number[other]):
                     a = np.int64(plane_of_patch[block, p])
                     b = np.int64(plane_of_patch[other, o])
-                    if other_key == tile_key and a >= b:
-                        continue
+                    if other_key == tile_key:
+                        a, b = min(a, b), max(a, b)
+                        if a == b:
+                            continue
                     pair = (a << 32) | (place << 16) | b
-                    if pair == last:
+                    slot = (31 * a + 7 * place + b) & (LATELY - 1)
+                    if lately[slot] == pair:
                         continue
                     if count == out.shape[0]:
                         return -1
-                    out[count] = pair
-                    last = pair
+                    out[count] = lately[slot] = pair
                     count += 1
     return count
 

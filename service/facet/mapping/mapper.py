@@ -14,7 +14,7 @@ from facet.mapping.census import Census, tile_points
 from facet.mapping.contours import ContourField
 from facet.mapping.describe import Describer, Figures, Told
 from facet.mapping.digest import Digest, derived_digest, model_planes, state_digest
-from facet.mapping.fitting import fit_plane
+from facet.mapping.fitting import fit_planes
 from facet.mapping.freespace import FreeSpace
 from facet.mapping.identity import Heritage, Identity
 from facet.mapping.invariants import check_invariants
@@ -267,18 +267,17 @@ class Mapper:
         )
         again = told.differ(ids, data)
         again[self._seen_planes()] = True
+        fitted = points.weight[again], points.centroid[again], points.scatter[again], unit[again]
+        fits = iter(fit_planes(*fitted, self.settings.tick_m))
         figures = {}
         for plane, plane_id in enumerate(ids.tolist()):
             if not again[plane]:
                 figures[plane_id] = told.figures[plane_id]
                 continue
-            centroid, scatter = points.centroid[plane], points.scatter[plane]
-            weight = float(points.weight[plane])
-            fit = fit_plane(weight, centroid, scatter, unit[plane], self.settings.tick_m)
             own = np.unique(self._table.tile_of[planes.label == plane])
             seen = self._witness.of(self._table.tile_keys[own].tolist())
             total, voxels = int(points.total[plane]), int(planes.occupation[plane])
-            figures[plane_id] = Figures(fit, total, voxels, centroid, seen)
+            figures[plane_id] = Figures(next(fits), total, voxels, points.centroid[plane], seen)
         self._told = Told(ids, data, figures)
         return figures
 

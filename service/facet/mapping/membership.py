@@ -1,294 +1,389 @@
-"""Which voxels belong to which tile-plane, and what they belonged to before."""
+"""Which voxels belong to which tile-plane, and what they belonged to before.
+
+The members of a tile-plane lie block by block: those in one block are a run. Only runs in blocks
+where something changed are collected again; the others go over to the tile-plane that their old one
+became, as they are."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import prange
+from numpy.typing import NDArray
 
 from facet.mapping.bits import population, trailing_zeros
-from facet.mapping.blocks import CENTRE, find, pack, row_at, unpack
-from facet.mapping.eigen import smallest
+from facet.mapping.blocks import CENTRE, row_at, unpack
 from facet.mapping.kernel import kernel
-from facet.mapping.merging import plane_of
-from facet.mapping.settings import BLOCK, STEPS, TILE
-from facet.mapping.store import centroid
-from facet.mapping.sums import SUMS, count_points, read_sums, shift_moments
 
-STRAY = 0.47  # voxels: a voxel whose centroid is so far off its tile-plane is not fitted to
-RIMMED = (12.0, 40.0)  # voxels: a tile-plane of such a width may be tilted by its rim
-CORE = 0.3  # voxels: centroids so near say where it truly lies
-ROUNDS = 4
-FEW = 30  # voxels say nothing
-SHELL = 1000  # blocks of a tile and of the shell round it
-CHUNK = 256  # members that are looked at together
+SHELL = 1000  # places of blocks in a tile and in the shell round it
+VOXELS = 512  # of a block
 PURE, MIXED, CLAIMED = range(3)  # what a member is to its tile-plane
+COLLECT, LOOK, MOVED, TOUCHED = 1, 2, 4, 8  # flags of a block: labels, or tile-planes of patches,
+# changed; borders, claims or centroids; centroids; sums of points
+NEW = -1  # a run that was not there before; below: OTHER - r, the run r with other members
+OTHER = -2
+
+
+class Runs(NamedTuple):
+    """The runs of tiles, R of them: by tile-plane of a tile, then by block key."""
+
+    block: NDArray[np.int32]  # (R,)
+    plane: NDArray[np.int16]  # (R,) tile-plane in its tile
+    size: NDArray[np.int16]  # (R,) members
+    margin: NDArray[np.float32]  # (R,) voxels that its tile-plane may move before a member's
+    # state can change
+
+
+class Held(NamedTuple):
+    """Members of N tiles, as the kernels take them."""
+
+    rows: NDArray[np.int32]  # (M,) voxel rows, run by run
+    state: NDArray[np.int8]  # (M,) PURE, MIXED or CLAIMED
+    block: NDArray[np.int32]  # (R,) and so on: see `Runs`
+    plane: NDArray[np.int16]
+    size: NDArray[np.int16]
+    margin: NDArray[np.float32]
+    start: NDArray[np.int64]  # (R,) where the rows of each run begin
+    old: NDArray[np.int64]  # (R,) the run that each was before, NEW: none, or OTHER
+    first: NDArray[np.int64]  # (N,) first run of each tile
+    last: NDArray[np.int64]  # (N,) the run behind its last
+
+
+class Listed(NamedTuple):
+    """The runs of a tile, by block; of new ones also the members. There is room for all."""
+
+    rows: NDArray[np.int32]
+    state: NDArray[np.int8]
+    block: NDArray[np.int32]
+    plane: NDArray[np.int16]
+    size: NDArray[np.int16]
+    start: NDArray[np.int64]  # in the rows here, or in the old ones
+    old: NDArray[np.int64]
+
+
+class Chain(NamedTuple):
+    """What runs a tile had, R of them, by block."""
+
+    head: NDArray[np.int64]  # (SHELL,) the first of a block, -1: none
+    link: NDArray[np.int64]  # (R,) the next, -1: none
+    kept: NDArray[np.bool_]  # (R,) went over whole
+    first: int  # number of the tile's first run
 
 
 @kernel
-def _collect(blocks, patches, plane_of_patch, tile_key, which, rows, owner, corner):  # type: ignore[no-untyped-def]
-    """Voxels of the blocks `which` whose patch, own or claiming, lies in the tile. How many."""
+def _collect(blocks, patches, plane_of_patch, tile_key, block, members):  # type: ignore[no-untyped-def]
+    """Voxels of a block whose patch, own or claiming, lies in the tile. How many."""
+    rows, owner, claimed = members
     ti, tj, tk = unpack(tile_key)
+    i, j, k = unpack(blocks.keys[block])
     count = 0
-    for q in range(which.shape[0]):
-        block = which[q]
-        i, j, k = unpack(blocks.keys[block])
-        for z in range(8):
-            word = blocks.occupied[block, z]
-            while word != np.uint64(0):
-                bit = np.int64(trailing_zeros(word))
-                word &= word - np.uint64(1)
-                row = row_at(blocks, block, 64 * z + bit)
-                for claim in range(2):
-                    label = patches.second[row] if claim else patches.label[row]
-                    if label < 0:
-                        continue
-                    n = label >> 4
-                    x, y, w = i + n % 3 - 1, j + (n // 3) % 3 - 1, k + n // 9 - 1
-                    if x >> 3 != ti or y >> 3 != tj or w >> 3 != tk:
-                        continue
-                    other = block if n == CENTRE else blocks.neighbours[block, n]
-                    rows[count] = row
-                    owner[count] = plane_of_patch[other, label & 15]
-                    corner[count] = claim == 1
-                    count += 1
-    return count
-
-
-@kernel
-def _shell(blocks, tile_key, out):  # type: ignore[no-untyped-def]
-    """Existing blocks of a tile and of the one-block shell round it, by ascending key."""
-    ti, tj, tk = unpack(tile_key)
-    count = 0
-    for i in range(8 * ti - 1, 8 * ti + 9):
-        for j in range(8 * tj - 1, 8 * tj + 9):
-            for k in range(8 * tk - 1, 8 * tk + 9):
-                block = find(blocks.table_keys, blocks.table_values, pack(i, j, k))
-                if block >= 0:
-                    out[count] = block
-                    count += 1
-    return count
-
-
-@kernel(parallel=True)
-def find_shells(blocks, tile_keys, near, num_near, room):  # type: ignore[no-untyped-def]
-    """For each tile the blocks that may hold its members, near (N, SHELL) and how many, and room:
-    as many members as there can be."""
-    for n in prange(tile_keys.shape[0]):
-        count = _shell(blocks, tile_keys[n], near[n])
-        voxels = np.int64(0)
-        for q in range(count):
-            for z in range(8):
-                voxels += np.int64(population(blocks.occupied[near[n, q], z]))
-        num_near[n], room[n] = count, 2 * voxels
-
-
-@kernel(parallel=True)
-def collect_members(  # type: ignore[no-untyped-def]
-    blocks, patches, plane_of_patch, tile_keys, near, num_near, first, starts, rows, corner
-):
-    """Members of all tile-planes of tiles: those of tile n from first[n] on, by tile-plane, of
-    which the t-th begins at starts[n, t], counted from there."""
-    for n in prange(tile_keys.shape[0]):
-        room = first[n + 1] - first[n]
-        own, owner, claimed = (
-            np.empty(room, np.int32),
-            np.empty(room, np.int16),
-            np.empty(room, np.bool_),
-        )
-        which = near[n, : num_near[n]]
-        count = _collect(blocks, patches, plane_of_patch, tile_keys[n], which, own, owner, claimed)
-        place = starts[n]
-        place[:] = 0
-        for m in range(count):
-            place[owner[m] + 1] += 1
-        for t in range(1, place.shape[0]):
-            place[t] += place[t - 1]
-        place = place.copy()
-        for m in range(count):  # a stable sort: members stay by block
-            at = first[n] + place[owner[m]]
-            place[owner[m]] += 1
-            rows[at], corner[at] = own[m], claimed[m]
-
-
-@kernel
-def inherit(old, new, scratch, counts):  # type: ignore[no-untyped-def]
-    """counts[old, new]: voxels that went from one tile-plane to another; old and new: rows (M,),
-    corner (M,), and where each tile-plane starts. scratch (V,) stays 0."""
-    rows, corner, starts = old
-    for t in range(starts.shape[0] - 1):
-        for m in range(starts[t], starts[t + 1]):
-            if not corner[m]:
-                scratch[rows[m]] = t + 1
-    rows, corner, starts = new
-    for t in range(starts.shape[0] - 1):
-        for m in range(starts[t], starts[t + 1]):
-            if not corner[m] and scratch[rows[m]] > 0:
-                counts[scratch[rows[m]] - 1, t] += 1
-    rows = old[0]
-    for m in range(rows.shape[0]):
-        scratch[rows[m]] = 0
-
-
-@kernel
-def list_abroad(blocks, block_of, tile_key, rows, corner, starts, ids, out):  # type: ignore[no-untyped-def]
-    """Members of a tile's tile-planes that lie in other tiles, with the plane ids (T,) that they go
-    by, as row << 32 | id. How many."""
-    ti, tj, tk = unpack(tile_key)
-    count = 0
-    for t in range(starts.shape[0] - 1):
-        for m in range(starts[t], starts[t + 1]):
-            if corner[m]:
-                continue
-            i, j, k = unpack(blocks.keys[block_of[rows[m]]])
-            if i >> 3 != ti or j >> 3 != tj or k >> 3 != tk:
-                out[count] = (np.int64(rows[m]) << 32) | ids[t]
+    for z in range(8):
+        word = blocks.occupied[block, z]
+        while word != np.uint64(0):
+            bit = np.int64(trailing_zeros(word))
+            word &= word - np.uint64(1)
+            row = row_at(blocks, block, 64 * z + bit)
+            for claim in range(2):
+                label = patches.second[row] if claim else patches.label[row]
+                if label < 0:
+                    continue
+                n = label >> 4
+                x, y, w = i + n % 3 - 1, j + (n // 3) % 3 - 1, k + n // 9 - 1
+                if x >> 3 != ti or y >> 3 != tj or w >> 3 != tk:
+                    continue
+                other = block if n == CENTRE else blocks.neighbours[block, n]
+                rows[count] = row
+                owner[count] = plane_of_patch[other, label & 15]
+                claimed[count] = claim == 1
                 count += 1
     return count
 
 
-@kernel(parallel=True)
-def sum_points(  # type: ignore[no-untyped-def]
-    rows, corner, starts, tile_keys, shares, blocks, columns, border, second, nodes, planes, points,
-    total
-):  # fmt: skip
-    """Sum the voxels' point moments about the tile's corner into points (T, 10), without those
-    that hold points of others: at a border, claimed by a plane at an angle, or STRAY from their
-    tile-plane; count all in total (T,). A tile-plane neither narrow nor wide is settled first:
-    the rim of a table's top tilts it.
-
-    planes: (T, 4) comes out: unit normal and offset of what members are STRAY from.
-    rows, corner: members of T tile-planes, one after another, those of t from starts[t] on;
-    tile_keys: (T,); shares: (S + 1,) tile-planes that each thread begins with.
-    Leftovers count as well: the tails of the noise lie in them, and without these a plane across
-    the grid is bent by where the grid cuts it."""
-    for share in prange(shares.shape[0] - 1):
-        places = np.empty((CHUNK, 3), np.int64)
-        state = np.empty(CHUNK, np.int8)
-        for t in range(shares[share], shares[share + 1]):
-            points[t] = 0
-            total[t] = 0
-            plane, width = _seen_from(nodes, t, tile_keys[t])
-            if RIMMED[0] <= width <= RIMMED[1]:
-                own = rows[starts[t] : starts[t + 1]], corner[starts[t] : starts[t + 1]]
-                plane = _settled(own, blocks, columns, border, second, tile_keys[t], plane)
-            planes[t, 0], planes[t, 1], planes[t, 2], planes[t, 3] = plane
-            for start in range(starts[t], starts[t + 1], CHUNK):
-                stop = min(starts[t + 1], start + CHUNK)
-                own = rows[start:stop], corner[start:stop]
-                _look(own, blocks, columns, border, second, tile_keys[t], plane, places, state)
-                total[t] += _add(own[0], columns, places, state, points[t])
+@kernel
+def _shell(blocks, flags, tile_key, members, near):  # type: ignore[no-untyped-def]
+    """Blocks of a tile, `members`, and those round them into near (SHELL,), by ascending key, -1
+    where there is none. Returns how many members can be in those that are flagged."""
+    ti, tj, tk = unpack(tile_key)
+    near[:] = -1
+    for q in range(members.shape[0]):
+        block = members[q]
+        i, j, k = unpack(blocks.keys[block])
+        x, y, z = i - 8 * ti, j - 8 * tj, k - 8 * tk
+        place = 100 * (x + 1) + 10 * (y + 1) + z + 1
+        near[place] = block
+        if 0 < x < 7 and 0 < y < 7 and 0 < z < 7:
+            continue
+        for n in range(27):
+            if n != CENTRE and blocks.neighbours[block, n] >= 0:
+                at = place + 100 * (n % 3 - 1) + 10 * (n // 3 % 3 - 1) + n // 9 - 1
+                near[at] = blocks.neighbours[block, n]
+    room = np.int64(0)
+    for place in range(SHELL):
+        if near[place] >= 0 and flags[near[place]] & COLLECT:
+            for z in range(8):
+                room += 2 * np.int64(population(blocks.occupied[near[place], z]))
+    return room
 
 
 @kernel
-def _seen_from(nodes, t, tile_key):  # type: ignore[no-untyped-def]
-    """(unit normal of a tile-plane and its offset from the corner of the tile, its width), voxels.
-    The width is 0 where it is too small to have one."""
-    ti, tj, tk = unpack(tile_key)
-    nx, ny, nz, _, across = plane_of(nodes.votes[t], nodes.scatter[t], nodes.unit[t])
-    mean = nodes.mean[t]
-    offset = nx * (mean[0] - TILE * ti) + ny * (mean[1] - TILE * tj) + nz * (mean[2] - TILE * tk)
-    return (nx, ny, nz, offset), np.sqrt(12.0 * max(0.0, across))
+def find_shells(blocks, flags, tile_keys, members, member_starts, near, room):  # type: ignore[no-untyped-def]
+    """For each tile, whose blocks begin at members[member_starts[n]], the blocks that may hold its
+    members, near (N, SHELL), and room (N,): as many as there can be in flagged ones."""
+    for n in range(tile_keys.shape[0]):
+        which = members[member_starts[n] : member_starts[n + 1]]
+        room[n] = _shell(blocks, flags, tile_keys[n], which, near[n])
 
 
 @kernel
-def _settled(own, blocks, columns, border, second, tile_key, plane):  # type: ignore[no-untyped-def]
-    """The plane moved to where most of the members' centroids lie. A rim that tilts it, or another
-    surface close by, is left behind."""
-    rows, corner = own
-    ti, tj, tk = unpack(tile_key)
-    spread = np.empty(6)
-    for _ in range(ROUNDS):
-        nx, ny, nz, offset = plane
-        n, pure = 0, 0
-        x, y, z, xx, xy, xz, yy, yz, zz = 0, 0, 0, 0, 0, 0, 0, 0, 0
-        for m in range(rows.shape[0]):
-            row = rows[m]
-            if corner[m] or border[row] or second[row] >= 0:
-                continue
-            a, b, c = centroid(blocks, columns, row)
-            a, b, c = a - STEPS * TILE * ti, b - STEPS * TILE * tj, c - STEPS * TILE * tk
-            pure += 1
-            if abs((nx * a + ny * b + nz * c) / STEPS - offset) > CORE:
-                continue
-            n, x, y, z = n + 1, x + a, y + b, z + c
-            xx, xy, xz = xx + a * a, xy + a * b, xz + a * c
-            yy, yz, zz = yy + b * b, yz + b * c, zz + c * c
-        if n < FEW or 2 * n < pure:
-            break
-        mx, my, mz = x / n, y / n, z / n
-        spread[0], spread[1], spread[2] = xx - x * mx, xy - x * my, xz - x * mz
-        spread[3], spread[4], spread[5] = yy - y * my, yz - y * mz, zz - z * mz
-        _, ux, uy, uz, _, _ = smallest(spread)
-        sign = 1.0 if ux * nx + uy * ny + uz * nz > 0.0 else -1.0
-        ux, uy, uz = sign * ux, sign * uy, sign * uz
-        plane = ux, uy, uz, (ux * mx + uy * my + uz * mz) / STEPS
-    return plane
+def _match(patches, plane_of_patch, before, members, num_old, num_new, into):  # type: ignore[no-untyped-def]
+    """into (O,): the tile-plane that each old one of a tile became, -1: none. Each has the most
+    votes of the other's patches."""
+    votes = np.zeros((num_old, num_new), np.int64)
+    for q in range(members.shape[0]):
+        block = members[q]
+        for p in range(patches.number[block]):
+            if 0 <= before[q, p] < num_old:
+                votes[before[q, p], plane_of_patch[block, p]] += patches.votes[block, p]
+    into[:] = -1
+    for old in range(num_old):
+        best = 0
+        for new in range(num_new):
+            if votes[old, new] > votes[old, best]:
+                best = new
+        alone = num_new > 0 and votes[old, best] > 0
+        for other in range(num_old * alone):
+            alone &= other == old or votes[other, best] < votes[old, best]
+        if alone:
+            into[old] = best
 
 
 @kernel
-def _look(own, blocks, columns, border, second, tile_key, plane, places, state):  # type: ignore[no-untyped-def]
-    """Where members lie in their tile, voxels, and what they are: PURE, not, or only claimed."""
-    rows, corner = own
-    ti, tj, tk = unpack(tile_key)
-    nx, ny, nz, offset = plane
-    for m in range(rows.shape[0]):  # nothing here waits for the last member
-        row = rows[m]
-        i, j, k = unpack(blocks.keys[columns.block[row]])
-        local = np.int64(columns.local[row])
-        seen = columns.observable[row]
-        x = BLOCK * i - TILE * ti + (local & 7)
-        y = BLOCK * j - TILE * tj + ((local >> 3) & 7)
-        z = BLOCK * k - TILE * tk + (local >> 6)
-        places[m, 0], places[m, 1], places[m, 2] = x, y, z
-        off = (
-            nx * (x + (seen & 15) / STEPS)
-            + ny * (y + ((seen >> 4) & 15) / STEPS)
-            + nz * (z + ((seen >> 8) & 15) / STEPS)
-            - offset
+def follow_planes(  # type: ignore[no-untyped-def]
+    blocks, patches, plane_of_patch, before, members, member_starts, first, counts, into, flags
+):
+    """What the old tile-planes of tiles became: those of tile n from into[first[n]] on, -1: none.
+    Flags the blocks round those with a patch that did not go there.
+
+    before: (Q, 12) tile-planes of the patches of the blocks `members` (Q,), those of tile n from
+    member_starts[n] on; counts: (N,) tile-planes of each tile now."""
+    for n in range(counts.shape[0]):
+        low, high = member_starts[n], member_starts[n + 1]
+        own = into[first[n] : first[n + 1]]
+        num_old = own.shape[0]
+        _match(
+            patches, plane_of_patch, before[low:high], members[low:high], num_old, counts[n], own
         )
-        mixed = border[row] | (second[row] >= 0) | (abs(off) > STRAY)
-        state[m] = CLAIMED if corner[m] else MIXED if mixed else PURE
+        for q in range(low, high):
+            block = members[q]
+            same = True
+            for p in range(patches.number[block]):
+                old = before[q, p]
+                same &= 0 <= old < num_old and own[old] == plane_of_patch[block, p]
+            for place in range(27 * (not same)):
+                other = block if place == CENTRE else blocks.neighbours[block, place]
+                if other >= 0:
+                    flags[other] |= COLLECT
 
 
 @kernel
-def _add(rows, columns, places, state, points):  # type: ignore[no-untyped-def]
-    """Add the moments of PURE members to points (10,). Returns the points of all."""
-    total = np.int64(0)
-    sums = np.empty(SUMS, np.int64)
-    for m in range(rows.shape[0]):
-        if state[m] == PURE:
-            read_sums(columns, rows[m], sums)
-            total += sums[0]
-            shift_moments(sums, places[m, 0], places[m, 1], places[m, 2], points)
-        elif state[m] == MIXED:
-            total += count_points(columns, rows[m])
-    return total
+def _chain(blocks, tile_key, before, first, last):  # type: ignore[no-untyped-def]
+    """By place in the shell (SHELL,) the first of the runs that a block had, (R,) the next one of
+    each; and whether it is there still: not yet."""
+    ti, tj, tk = unpack(tile_key)
+    head, link = np.full(SHELL, -1, np.int64), np.empty(last - first, np.int64)
+    for r in range(last - 1, first - 1, -1):
+        i, j, k = unpack(blocks.keys[before.block[r]])
+        place = ((i - 8 * ti + 1) * 10 + (j - 8 * tj + 1)) * 10 + (k - 8 * tk + 1)
+        link[r - first] = head[place]
+        head[place] = r
+    return Chain(head, link, np.zeros(last - first, np.bool_), first)
 
 
 @kernel
-def add_changes(  # type: ignore[no-untyped-def]
-    rows, before, first, blocks, columns, border, patches, plane_of_patch, tile_keys, planes,
-    points, total
+def _take_over(before, r, plane, chain, listed, run, counts):  # type: ignore[no-untyped-def]
+    """List a run as what an old one is now, and count its voxels."""
+    start, stay = before.start[r], 0
+    for m in range(start, start + before.size[r]):
+        stay += before.state[m] != CLAIMED
+    counts[before.plane[r], plane] += stay
+    chain.kept[r - chain.first] = True
+    listed.block[run], listed.plane[run] = before.block[r], plane
+    listed.size[run], listed.start[run], listed.old[run] = before.size[r], start, r
+
+
+@kernel
+def _split(members, count, block, listed, num, end):  # type: ignore[no-untyped-def]
+    """List the members of a block as new runs, one for each tile-plane, whose rows begin at `end`.
+    Returns (runs, rows) that are listed now."""
+    rows, owner, claimed = members
+    for m in range(count):
+        plane = owner[m]
+        if plane < 0:
+            continue
+        start = end
+        for other in range(m, count):
+            if owner[other] == plane:
+                listed.rows[end] = rows[other]
+                listed.state[end] = CLAIMED if claimed[other] else PURE
+                owner[other] = -1
+                end += 1
+        listed.block[num], listed.plane[num] = block, plane
+        listed.size[num], listed.start[num], listed.old[num] = end - start, start, NEW
+        num += 1
+    return num, end
+
+
+@kernel
+def _same_run(before, r, listed, run):  # type: ignore[no-untyped-def]
+    """Whether an old run held just the members of a new one."""
+    if before.size[r] != listed.size[run]:
+        return False
+    at, start = before.start[r], listed.start[run]
+    for m in range(before.size[r]):
+        if before.rows[at + m] != listed.rows[start + m]:
+            return False
+        if (before.state[at + m] == CLAIMED) != (listed.state[start + m] == CLAIMED):
+            return False
+    return True
+
+
+@kernel
+def _recognise(before, place, chain, into, listed, begin, num, counts):  # type: ignore[no-untyped-def]
+    """Find what runs of a block, listed from `begin` to `num`, were before."""
+    for run in range(begin, num):
+        plane = listed.plane[run]
+        r = chain.head[place]
+        while r >= 0:
+            if into[before.plane[r]] == plane:
+                if _same_run(before, r, listed, run):
+                    _take_over(before, r, plane, chain, listed, run, counts)
+                else:
+                    listed.old[run] = OTHER - r
+                break
+            r = chain.link[r - chain.first]
+
+
+@kernel
+def _inherit(before, place, chain, local, listed, begin, num, was, counts):  # type: ignore[no-untyped-def]
+    """Count the voxels that went from runs of a block that are no more to new ones; was (VOXELS,)
+    stays 0."""
+    r = chain.head[place]
+    while r >= 0:
+        if not chain.kept[r - chain.first]:
+            for m in range(before.start[r], before.start[r] + before.size[r]):
+                if before.state[m] != CLAIMED:
+                    was[local[before.rows[m]]] = before.plane[r] + 1
+        r = chain.link[r - chain.first]
+    for run in range(begin, num):
+        if listed.old[run] <= NEW:
+            for m in range(listed.start[run], listed.start[run] + listed.size[run]):
+                old = was[local[listed.rows[m]]]
+                if old > 0 and listed.state[m] != CLAIMED:
+                    counts[old - 1, listed.plane[run]] += 1
+    was[:] = 0
+
+
+@kernel
+def _list_runs(  # type: ignore[no-untyped-def]
+    blocks, local, patches, plane_of_patch, flags, tile_key, near, before, chain, into, counts,
+    listed
 ):  # fmt: skip
-    """Add to `sum_points` of T tile-planes what came to their members `rows` (R,) since they had
-    the sums `before` (R, SUMS). All else must be as it was then.
+    """List the runs of a tile by block. How many."""
+    room = 2 * VOXELS
+    members = np.empty(room, np.int32), np.empty(room, np.int16), np.empty(room, np.bool_)
+    was = np.zeros(VOXELS, np.int16)
+    num, end = 0, 0
+    for place in range(SHELL):
+        block = near[place]
+        if block < 0:
+            continue
+        if not flags[block] & COLLECT:
+            r = chain.head[place]
+            while r >= 0:
+                plane = into[before.plane[r]]
+                _take_over(before, r, plane, chain, listed, num, counts)
+                num += 1
+                r = chain.link[r - chain.first]
+            continue
+        begin = num
+        count = _collect(blocks, patches, plane_of_patch, tile_key, block, members)
+        num, end = _split(members, count, block, listed, num, end)
+        _recognise(before, place, chain, into, listed, begin, num, counts)
+        _inherit(before, place, chain, local, listed, begin, num, was, counts)
+    return num
 
-    first: (B,) of the tile-planes, that of a block's tile which comes first, -1: none of these."""
-    places, state = np.empty((1, 3), np.int64), np.empty(1, np.int8)
-    sums, corner = np.empty(SUMS, np.int64), np.zeros(1, np.bool_)
-    for q in range(rows.shape[0]):
-        block, label = columns.block[rows[q]], patches.label[rows[q]]
-        if label < 0:
+
+@kernel
+def _sort(listed, num, num_planes, before, held, n):  # type: ignore[no-untyped-def]
+    """Put the runs of tile n in order of their tile-planes."""
+    first = held.first[n]
+    held.last[n] = first + num
+    num_runs, num_rows = np.zeros(num_planes + 1, np.int64), np.zeros(num_planes + 1, np.int64)
+    for run in range(num):
+        num_runs[listed.plane[run] + 1] += 1
+        num_rows[listed.plane[run] + 1] += listed.size[run]
+    for t in range(1, num_planes + 1):
+        num_runs[t] += num_runs[t - 1]
+        num_rows[t] += num_rows[t - 1]
+    for run in range(num):
+        t, size, at = listed.plane[run], np.int64(listed.size[run]), listed.start[run]
+        r, start = first + num_runs[t], first + num_rows[t]
+        held.block[r], held.plane[r], held.size[r] = listed.block[run], t, size
+        held.start[r], held.old[r] = start, listed.old[run]
+        if listed.old[run] <= NEW:
+            for m in range(size):
+                held.rows[start + m] = listed.rows[at + m]
+                held.state[start + m] = listed.state[at + m]
+        else:
+            held.margin[r] = before.margin[listed.old[run]]
+            for m in range(size):
+                held.rows[start + m] = before.rows[at + m]
+                held.state[start + m] = before.state[at + m]
+        num_runs[t], num_rows[t] = num_runs[t] + 1, num_rows[t] + size
+
+
+@kernel(parallel=True)
+def gather_members(  # type: ignore[no-untyped-def]
+    blocks, local, patches, plane_of_patch, flags, tile_keys, near, parts, before, into, planes,
+    counts, held
+):  # fmt: skip
+    """The members of tiles (N,), who were `before`, into `held`: the runs and rows of tile n from
+    held.first[n] on. near: (N, SHELL) blocks; parts: tiles that each thread begins with.
+
+    planes: (N + 1, 3) where a tile's old tile-planes begin in into (O,), what these became, -1:
+    nothing; how many it has now; and where its counts begin, (old, new): voxels that went."""
+    for part in prange(parts.shape[0] - 1):
+        for n in range(parts[part], parts[part + 1]):
+            room = held.last[n] - held.first[n]
+            listed = Listed(
+                np.empty(room, np.int32), np.empty(room, np.int8), np.empty(room, np.int32),
+                np.empty(room, np.int16), np.empty(room, np.int16), np.empty(room, np.int64),
+                np.empty(room, np.int64),
+            )  # fmt: skip
+            own = into[planes[n, 0] : planes[n + 1, 0]]
+            went = counts[planes[n, 2] : planes[n + 1, 2]].reshape(own.shape[0], planes[n, 1])
+            chain = _chain(blocks, tile_keys[n], before, before.first[n], before.last[n])
+            num = _list_runs(
+                blocks, local, patches, plane_of_patch, flags, tile_keys[n], near[n], before, chain,
+                own, went, listed,
+            )  # fmt: skip
+            _sort(listed, num, planes[n, 1], before, held, n)
+
+
+@kernel
+def list_abroad(blocks, tile_key, rows, state, runs, ids, out):  # type: ignore[no-untyped-def]
+    """Members of a tile's tile-planes that lie in other tiles, with the plane ids (T,) that they go
+    by, as row << 32 | id. How many."""
+    ti, tj, tk = unpack(tile_key)
+    count, start = 0, 0
+    for r in range(runs.block.shape[0]):
+        begin, start = start, start + runs.size[r]
+        i, j, k = unpack(blocks.keys[runs.block[r]])
+        if i >> 3 == ti and j >> 3 == tj and k >> 3 == tk:
             continue
-        other = block if label >> 4 == CENTRE else blocks.neighbours[block, label >> 4]
-        if first[other] < 0:
-            continue
-        t = first[other] + plane_of_patch[other, label & 15]
-        plane = planes[t, 0], planes[t, 1], planes[t, 2], planes[t, 3]
-        own = rows[q : q + 1], corner
-        _look(own, blocks, columns, border, patches.second, tile_keys[t], plane, places, state)
-        read_sums(columns, rows[q], sums)
-        sums -= before[q]
-        total[t] += sums[0]
-        if state[0] == PURE:
-            shift_moments(sums, places[0, 0], places[0, 1], places[0, 2], points[t])
+        for m in range(begin, start):
+            if state[m] != CLAIMED:
+                out[count] = (np.int64(rows[m]) << 32) | ids[runs.plane[r]]
+                count += 1
+    return count

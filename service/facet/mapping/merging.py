@@ -166,12 +166,13 @@ def _root(parent, t):  # type: ignore[no-untyped-def]
 
 @kernel
 def _try(votes, mean, scatter, unit, normals, narrow, a, b, limit, m, s, u):  # type: ignore[no-untyped-def]
-    """Whether a and b (a the larger) are one plane; m, s, u are then its statistics."""
+    """Whether a and b (a the larger) are one plane; m, s, u are then its statistics, and what comes
+    with it its normal and the variance across it."""
     if _best_cos(normals, narrow, unit, a, b) < limit.cos:
-        return False
+        return False, 0.0, 0.0, 0.0, 0.0
     w = _offset(normals, mean, a, b)
     if abs(w) > limit.offset:
-        return False
+        return False, 0.0, 0.0, 0.0, 0.0
     n = normals[a]
     sb = scatter[b]
     spread = (
@@ -179,16 +180,16 @@ def _try(votes, mean, scatter, unit, normals, narrow, a, b, limit, m, s, u):  # 
         + 2.0 * (sb[1] * n[0] * n[1] + sb[2] * n[0] * n[2] + sb[4] * n[1] * n[2])
     ) / votes[b]  # fmt: skip
     if spread + w * w > limit.offset * limit.offset:  # P4
-        return False
+        return False, 0.0, 0.0, 0.0, 0.0
     total = pool(votes[a], mean[a], scatter[a], votes[b], mean[b], sb, m, s)
     u[0], u[1], u[2] = unit[a, 0] + unit[b, 0], unit[a, 1] + unit[b, 1], unit[a, 2] + unit[b, 2]
     nx, ny, nz, variance, across = plane_of(total, s, u)
     if variance > limit.variance:
-        return False
+        return False, 0.0, 0.0, 0.0, 0.0
     # a bridge: the merged normal leaves its members' own by more than noise tilts a thing so wide
     noise = limit.tilt / np.sqrt(across) if across > 0.0 else 1.0
     allowed = np.cos(min(1.5, limit.bridge + np.arctan(noise)))
-    return _agreement(nx, ny, nz, u) >= allowed
+    return _agreement(nx, ny, nz, u) >= allowed, nx, ny, nz, across
 
 
 @kernel
@@ -209,14 +210,16 @@ def _merge(votes, mean, scatter, unit, normals, narrow, edges, limit):  # type: 
                 continue
             tried[e, 0], tried[e, 1] = version[a], version[b]
             large, small = (a, b) if votes[a] >= votes[b] else (b, a)
-            if not _try(votes, mean, scatter, unit, normals, narrow, large, small, limit, m, s, u):
+            one, nx, ny, nz, across = _try(
+                votes, mean, scatter, unit, normals, narrow, large, small, limit, m, s, u
+            )
+            if not one:
                 continue
             merged = True
             keep, drop = min(a, b), max(a, b)
             parent[drop] = keep
             votes[keep] = votes[a] + votes[b]
             mean[keep], scatter[keep], unit[keep] = m, s, u
-            nx, ny, nz, _, across = plane_of(votes[keep], s, u)
             narrow[keep] = 12.0 * across < NARROW * NARROW
             normals[keep, 0], normals[keep, 1], normals[keep, 2] = nx, ny, nz
             version[keep] = version[a] + version[b] + 1

@@ -19,7 +19,7 @@ from facet.mapping.kernel import kernel
 from facet.mapping.merging import Limits, Nodes, merge_nodes, plane_of, pool
 from facet.mapping.runs import starts_of
 from facet.mapping.settings import TICKS, TILE, MapSettings
-from facet.mapping.tiles import Tile, edges_of
+from facet.mapping.tile import Tile, edges_of
 
 FREE = -1
 ADOPTIONS = 10  # rounds in which freed tile-planes are offered to the planes beside them

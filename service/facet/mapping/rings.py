@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from facet.mapping.kernel import kernel
+from facet.mapping.runs import starts_of
 
 OUTWARD = 2.0  # grid units (1/8 voxel): a border centroid sits inside its voxel
 ROW = 24  # grid units: points so near to one another are of one row of voxels
@@ -121,6 +123,52 @@ def _chains(follow):  # type: ignore[no-untyped-def]
     return edges[:num], ends[:num_chains]
 
 
+@kernel
+def _split(chained, ends, keys):  # type: ignore[no-untyped-def]
+    """Chains of edges (N,), each up to one of ends (C,), as rings of them that pass no vertex
+    twice, each from its smallest; keys: (E,) of the vertices that edges start from, ascending.
+    Signed areas add up to those of the chains. Rings of two edges are left out.
+
+    Returns their edges (M,), and where each ring ends (R,)."""
+    edges, stops = np.empty(chained.shape[0], np.int64), np.empty(chained.shape[0], np.int64)
+    at = np.full(keys.shape[0], -1, np.int64)  # where on the path a vertex is
+    path = np.empty(chained.shape[0], np.int64)
+    num, rings, begin = 0, 0, 0
+    for c in range(ends.shape[0]):
+        length = 0
+        for n in range(begin, ends[c] + 1):
+            vertex = -1
+            if n < ends[c]:
+                vertex = np.searchsorted(keys, keys[chained[n]])
+            cut = 0 if vertex < 0 else at[vertex]
+            if cut >= 0:  # the path comes back to a vertex, or the chain ends
+                if length - cut > 2:
+                    num = _turn(path[cut:length], keys, edges, num)
+                    stops[rings] = num
+                    rings += 1
+                for p in range(cut, length):
+                    at[np.searchsorted(keys, keys[path[p]])] = -1
+                length = cut
+            if vertex >= 0:
+                at[vertex] = length
+                path[length] = chained[n]
+                length += 1
+        begin = ends[c]
+    return edges[:num], stops[:rings]
+
+
+@kernel
+def _turn(path, keys, edges, num):  # type: ignore[no-untyped-def]
+    """Append a ring to edges, from its smallest vertex on. Returns the number of edges."""
+    first = 0
+    for p in range(path.shape[0]):
+        if keys[path[p]] < keys[path[first]]:
+            first = p
+    for p in range(path.shape[0]):
+        edges[num + p] = path[(first + p) % path.shape[0]]
+    return num + path.shape[0]
+
+
 def stitch(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """Closed rings (M, 2) of directed edges (E, 4), each from its smallest vertex, in order of it.
 
@@ -136,41 +184,26 @@ def stitch(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     single = _single(start, stop, edges[order], ROW)
     edges, start, stop = edges[order[single]], start[single], stop[single]
     chained, ends = _chains(_successors(start, stop, edges))
-    rings = []
-    for chain in np.split(chained, ends[:-1]) if len(ends) else []:
-        rings.extend(_simple_rings(edges[chain, :2], start[chain]))
-    return sorted(rings, key=lambda ring: tuple(ring[0]))
-
-
-def _simple_rings(ring: NDArray[np.int64], keys: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """A ring split where it comes back to a vertex, so that none touches itself. Signed areas add
-    up to that of the whole. keys: (M,) of the vertices, ascending by (u, v)."""
-    if len(np.unique(keys)) == len(keys):
-        return [np.roll(ring, -int(np.argmin(keys)), axis=0)] if len(ring) > 2 else []
-    rings, path = [], list[int]()
-    place: dict[int, int] = {}
-    for index, key in enumerate(keys.tolist()):
-        if key in place:
-            begin = place[key]
-            rings.append(path[begin:])
-            for dropped in path[begin:]:
-                del place[int(keys[dropped])]
-            path = path[:begin]
-        place[key] = len(path)
-        path.append(index)
-    rings.append(path)
-    simple = []
-    for chain in rings:
-        if len(chain) > 2:
-            first = int(np.argmin(keys[chain]))
-            simple.append(ring[np.roll(chain, -first)])
-    return simple
+    chained, ends = _split(chained, ends, start)
+    vertices, begins = edges[chained, :2], starts_of(np.diff(ends, prepend=0))
+    rings = [vertices[a:b] for a, b in zip(begins.tolist(), ends.tolist(), strict=False)]
+    by_first = np.argsort(start[chained[begins[:-1]]], kind="stable").tolist()
+    return [rings[n] for n in by_first]
 
 
 def signed_area(ring: NDArray[np.int64] | NDArray[np.int32]) -> float:
     """Shoelace, positive counter-clockwise."""
-    u, v = ring[:, 0].astype(np.int64), ring[:, 1].astype(np.int64)
-    return float(np.sum(u * np.roll(v, -1) - np.roll(u, -1) * v)) / 2.0
+    return float(_shoelace(ring)) / 2.0
+
+
+@kernel
+def _shoelace(ring):  # type: ignore[no-untyped-def]
+    """Twice the signed area of a ring (M, 2)."""
+    total = np.int64(0)
+    for m in range(ring.shape[0]):
+        n = m + 1 if m + 1 < ring.shape[0] else 0
+        total += np.int64(ring[m, 0]) * ring[n, 1] - np.int64(ring[n, 0]) * ring[m, 1]
+    return total
 
 
 @kernel
@@ -206,25 +239,39 @@ def surfaces_of(edges: NDArray[np.int64], least_area: float) -> list[Outline]:
             if inside(outers[i][0], u, v):
                 holes[i].append(ring)
                 break
+    whole = [
+        (outer, own)
+        for (outer, area), own in zip(outers, holes, strict=True)
+        if area + sum(signed_area(hole) for hole in own) >= least_area
+    ]  # without rows of voxels round nothing
+    moved = iter(outward([ring for outer, own in whole for ring in (outer, *own)]))
     outlines = []
-    for (outer, _), own in zip(outers, holes, strict=True):
-        grown = outward(outer)
-        shrunk = [h for h in (outward(hole) for hole in own) if signed_area(h) < 0.0]
-        if signed_area(outer) + sum(signed_area(hole) for hole in own) < least_area:
-            continue  # rows of voxels round nothing
-        area = signed_area(grown) + float(sum(signed_area(h) for h in shrunk))
+    for _, own in whole:
+        grown, *others = itertools.islice(moved, 1 + len(own))
+        sizes = [signed_area(hole) for hole in others]
+        shrunk = [hole for hole, size in zip(others, sizes, strict=True) if size < 0.0]
+        area = signed_area(grown) + float(sum(size for size in sizes if size < 0.0))
         outlines.append(Outline(grown, shrunk, area))
     return outlines
 
 
-def outward(ring: NDArray[np.int64]) -> NDArray[np.int32]:
+def outward(rings: list[NDArray[np.int64]]) -> list[NDArray[np.int32]]:
     """Each vertex moved by OUTWARD away from the surface, along the mean of its edges' normals."""
-    p = ring.astype(np.float64)
-    step = np.roll(p, -1, axis=0) - p
+    if not rings:
+        return []
+    starts = starts_of([len(ring) for ring in rings])
+    firsts, lasts = starts[:-1], starts[1:] - 1
+    after, before = np.arange(1, starts[-1] + 1), np.arange(-1, starts[-1] - 1)
+    after[lasts], before[firsts] = firsts, lasts
+    p = np.concatenate(rings).astype(np.float64)
+    step = p[after] - p
     step /= np.hypot(step[:, 0], step[:, 1])[:, None]
     right = np.stack([step[:, 1], -step[:, 0]], axis=1)  # the surface is on the left
-    mean = right + np.roll(right, 1, axis=0)
+    mean = right + right[before]
     norm2 = np.maximum(np.sum(mean * mean, axis=1), 0.5)  # a miter of at most 2.8
     moved = np.floor(p + OUTWARD * 2.0 * mean / norm2[:, None] + 0.5).astype(np.int32)
-    keep = np.any(moved != np.roll(moved, 1, axis=0), axis=1)
-    return np.asarray(moved[keep] if int(keep.sum()) > 2 else moved, dtype=np.int32)
+    keep = np.any(moved != moved[before], axis=1)
+    keep |= np.repeat(np.add.reduceat(keep, firsts, dtype=np.int64) <= 2, np.diff(starts))
+    kept = starts_of(keep)[starts].tolist()
+    moved = moved[keep]
+    return [moved[a:b].copy() for a, b in itertools.pairwise(kept)]
