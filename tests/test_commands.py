@@ -9,6 +9,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,7 @@ from facet.__main__ import _said, app
 from facet.commands.demo import _is_alive
 from facet.commands.imports import _nanoseconds, _read_npz, _read_poses
 from facet.commands.replay import replay_log
+from facet.commands.settings import load_loops
 from facet.commands.terminal import InputError
 from facet.config import Config
 from facet.session import client_settings, open_session
@@ -177,6 +179,24 @@ def test_info(log: Path, tmp_path: Path) -> None:
     assert "foxglove.PointCloud" in text
     facet("replay", log, "--out", tmp_path)
     assert "floor" in facet("info", tmp_path / "model.json")
+
+
+@pytest.mark.parametrize("command", ["replay", "digest", "export"])
+def test_who_waits_for_the_compiler_is_told(
+    command: str, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def compile_slowly(settings: object) -> None:
+        wait_until(lambda: not any(isinstance(t, threading.Timer) for t in threading.enumerate()))
+
+    monkeypatch.setattr("facet.warmup.warm_up", compile_slowly)
+    monkeypatch.setattr("facet.commands.terminal.PATIENCE_S", 0.0)
+    load_loops.cache_clear()
+    more = [tmp_path / "a.glb"] if command == "export" else []
+    text = facet(command, log, *more)
+    load_loops.cache_clear()
+    assert "compiling the mapper's loops" in text
+    monkeypatch.undo()
+    assert "compiling" not in facet(command, log, *more)  # they are there
 
 
 def test_export_from_a_log_and_from_a_model(log: Path, tmp_path: Path) -> None:
