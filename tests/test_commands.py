@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -41,6 +42,7 @@ COMMANDS = (
     *("run", "play", "status", "top", "cmd", "replay", "simulate"),
     *("export", "info", "digest", "recover", "config", "demo", "import"),
 )
+RECORDINGS = Path(__file__).parents[1] / "recordings"
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
@@ -197,6 +199,14 @@ def test_who_waits_for_the_compiler_is_told(
     assert "compiling the mapper's loops" in text
     monkeypatch.undo()
     assert "compiling" not in facet(command, log, *more)  # they are there
+
+
+@pytest.mark.parametrize("path", sorted(RECORDINGS.glob("*.mcap")), ids=lambda path: path.stem)
+def test_the_bundled_recordings_are_whole(path: Path) -> None:
+    """And what the table says: `make recordings` has made them since logs became what they are."""
+    facet("info", path)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert digest in (path.parent / "README.md").read_text("utf-8")
 
 
 def test_export_from_a_log_and_from_a_model(log: Path, tmp_path: Path) -> None:
