@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import re
@@ -9,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,7 @@ from facet.__main__ import _said, app
 from facet.commands.demo import _is_alive
 from facet.commands.imports import _nanoseconds, _read_npz, _read_poses
 from facet.commands.replay import replay_log
+from facet.commands.settings import load_loops
 from facet.commands.terminal import InputError
 from facet.config import Config
 from facet.session import client_settings, open_session
@@ -39,6 +42,7 @@ COMMANDS = (
     *("run", "play", "status", "top", "cmd", "replay", "simulate"),
     *("export", "info", "digest", "recover", "config", "demo", "import"),
 )
+RECORDINGS = Path(__file__).parents[1] / "recordings"
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
@@ -177,6 +181,32 @@ def test_info(log: Path, tmp_path: Path) -> None:
     assert "foxglove.PointCloud" in text
     facet("replay", log, "--out", tmp_path)
     assert "floor" in facet("info", tmp_path / "model.json")
+
+
+@pytest.mark.parametrize("command", ["replay", "digest", "export"])
+def test_who_waits_for_the_compiler_is_told(
+    command: str, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def compile_slowly(settings: object) -> None:
+        wait_until(lambda: not any(isinstance(t, threading.Timer) for t in threading.enumerate()))
+
+    monkeypatch.setattr("facet.warmup.warm_up", compile_slowly)
+    monkeypatch.setattr("facet.commands.terminal.PATIENCE_S", 0.0)
+    load_loops.cache_clear()
+    more = [tmp_path / "a.glb"] if command == "export" else []
+    text = facet(command, log, *more)
+    load_loops.cache_clear()
+    assert "compiling the mapper's loops" in text
+    monkeypatch.undo()
+    assert "compiling" not in facet(command, log, *more)  # they are there
+
+
+@pytest.mark.parametrize("path", sorted(RECORDINGS.glob("*.mcap")), ids=lambda path: path.stem)
+def test_the_bundled_recordings_are_whole(path: Path) -> None:
+    """And what the table says: `make recordings` has made them since logs became what they are."""
+    facet("info", path)
+    digest = hashlib.sha256(path.read_bytes()).hexdigest()
+    assert digest in (path.parent / "README.md").read_text("utf-8")
 
 
 def test_export_from_a_log_and_from_a_model(log: Path, tmp_path: Path) -> None:

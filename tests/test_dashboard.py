@@ -89,7 +89,45 @@ def test_a_retired_plane_is_cleared(tmp_path):
     viewer.close()
     rows = _entities(tmp_path / "m.rrd")
     assert rows["/map/planes/wall/3"][-1]["Clear:is_recursive"] == [True]
-    assert rows["/events"][-1]["TextLog:text"] == ["wall 3 merged into 4"]
+    assert rows["/events"][-1]["TextLog:text"] == ["15:06:40 wall 3 merged into wall 4"]
+
+
+def test_an_event_leads_to_its_plane(tmp_path):
+    """By the name on the screen, and by the colour."""
+    viewer = RrdViewer(tmp_path / "m.rrd")
+    created = Event(1, EventKind.CREATED, 3, 0, 1, office.STAMP_NS)
+    updated = Event(2, EventKind.UPDATED, 2, 0, 1, office.STAMP_NS)
+    split = Event(3, EventKind.SPLIT, 2, 1, 1, office.STAMP_NS)
+    viewer.write_update(replace(office.snapshot(1), events=(created, updated, split)))
+    viewer.close()
+    rows = _entities(tmp_path / "m.rrd")
+    said = [(row["TextLog:text"][0], row["TextLog:color"][0]) for row in rows["/events"]]
+    colours = {}
+    for path in ("wall/3", "floor/1", "overhead/ceiling/2"):
+        name = rows[f"/map/planes/{path}/name"][-1]
+        colours[name["Points3D:labels"][0]] = name["Points3D:colors"][0]
+        (corner,) = name["Points3D:positions"]
+        number = int(path.rpartition("/")[2])
+        plane = next(plane for plane in office.planes() if plane.id == number)
+        assert np.dot(plane.normal, corner) == pytest.approx(plane.d, abs=1e-6)
+    assert said[:2] == [
+        (f"15:06:40 wall 3 created, {area_of(3):.1f} m²", colours["wall 3"]),
+        (f"15:06:40 ceiling 2 split from floor 1, {area_of(2):.1f} m²", colours["ceiling 2"]),
+    ]
+    assert said[2][0] == "15:06:40 1 planes updated, revision 1"
+    assert said[2][1] not in colours.values()
+
+
+def area_of(number):
+    return sum(s.area_m2 for p in office.planes() if p.id == number for s in p.surfaces)
+
+
+@pytest.mark.parametrize(("side_m", "is_shown"), [(3.0, True), (1.0, False)])
+def test_small_planes_do_not_cover_the_map_with_their_names(side_m, is_shown):
+    square = office.surface(1, office.rectangle((0.0, 0.0, side_m, side_m)), [])
+    plane = replace(office.planes()[0], surfaces=(square,))
+    assert drawing.label(plane).show_labels.as_arrow_array().to_pylist() == [is_shown]
+    assert drawing.label(replace(plane, surfaces=())) is None
 
 
 def test_a_snapshot_clears_what_it_does_not_name(tmp_path):

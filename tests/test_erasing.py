@@ -168,8 +168,13 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         for parameters, said in {
             "": "say robot=NAME",
             "?robot=a b": "is not [A-Za-z0-9_-]",
-            "?robot=r1;last=x": "last='x' is not a number",
-            "?robot=r1;speed=3": "speed= is not one of robot, sensor",
+            "?robot=r1;last=x": "last='x' is not a number from 1",
+            "?robot=r1;last=0": "last='0' is not a number from 1",  # not: all of them
+            f"?robot=r1;last={'9' * 5000}": "is not a number from 1",
+            "?robot=r1;first=3;last=2": "first=3 comes after last=2",
+            "?robot=r1;sensor=": "sensor= has no value",  # not: every one
+            "?robot=r1;robot=r2": "robot= comes twice, 'r1' and 'r2'",
+            "?robot=r1;speed=3": "'speed=3' is no parameter of erase, which takes robot=, sensor=",
             "?robot=r9": "nothing was erased: unknown_scan",
         }.items():
             assert said in ask(client, COMMAND + parameters)

@@ -10,10 +10,10 @@ from PIL import Image
 from plyfile import PlyData
 
 import office
-from facet.export.colours import plane_colour, point_colours
+from facet.export.colours import UNASSIGNED, plane_colour, point_colours
 from facet.export.formats import FORMATS
 from facet.export.model import build_model
-from facet_protocol.messages import TilePoints
+from facet_protocol.messages import PlaneClass, TilePoints
 
 MAGIC = {"json": b"{", "ply": b"ply", "glb": b"glTF", "png": b"\x89PNG"}
 
@@ -84,10 +84,20 @@ def test_picture_shows_both_halves(tmp_path):
     assert ink[half:].mean() > 0.05
 
 
-def test_colours_last_and_differ():
-    assert plane_colour(7) == plane_colour(7)
-    assert len({plane_colour(k) for k in range(1, 200)}) > 190
-    colours = point_colours(np.array([0, 5, 0, 5], dtype=np.int32))
+@pytest.mark.parametrize("kind", PlaneClass)
+def test_a_plane_has_its_own_shade_of_its_class(kind):
+    shades = np.array([plane_colour(k, kind) for k in range(1, 200)])
+    assert len(np.unique(shades, axis=0)) > 190
+    for away in (1, 2, 3, 4):  # planes that are found together have ids near each other
+        assert np.abs(shades[away:] - shades[:-away]).max(axis=1).min() >= 10
+    others = np.array([plane_colour(k, c) for k in range(1, 200) for c in PlaneClass if c != kind])
+    assert np.abs(shades[:, None] - others[None]).max(axis=2).min() > 0
+
+
+def test_points_have_the_shade_of_their_plane():
+    colours = point_colours(np.array([0, 5, 0, 6], dtype=np.int32), {5: PlaneClass.WALL})
     assert colours.shape == (4, 3)
-    assert tuple(colours[1]) == plane_colour(5)
-    assert point_colours(np.zeros(0, dtype=np.int32)).shape == (0, 3)
+    assert tuple(colours[1]) == plane_colour(5, PlaneClass.WALL)
+    assert tuple(colours[3]) == plane_colour(6, PlaneClass.OTHER)
+    assert tuple(colours[0]) == UNASSIGNED
+    assert point_colours(np.zeros(0, dtype=np.int32), {}).shape == (0, 3)

@@ -1,10 +1,19 @@
 """Triangles cover exactly what the rings enclose, and face the side that was seen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 import office
-from facet.export.triangles import inward_normal, polygon, surface_triangles, triangulate
+from facet.export.triangles import (
+    inward_normal,
+    middle_of,
+    polygon,
+    surface_triangles,
+    triangulate,
+)
+from facet_protocol.messages import HoleKind
 
 
 def _area(vertices: np.ndarray, faces: np.ndarray) -> float:
@@ -21,6 +30,20 @@ def test_areas_are_those_of_the_rings(planes):
             vertices, faces = triangulate(surface.outer, holes)
             expected = polygon(surface.outer, holes).area
             assert _area(vertices, faces) == pytest.approx(expected, rel=1e-3)
+
+
+def test_the_middle_of_a_surface_lies_on_it():
+    ring = office.rectangle((0.0, 0.0, 4.0, 4.0))
+    floor = office.planes()[0]
+    for box, expected in (((1.0, 1.0, 1.1, 1.1), (2.0, 2.0)), ((0.5, 0.5, 3.5, 3.5), None)):
+        surface = office.surface(1, ring, [(HoleKind.OPENING, box)])
+        x, y, z = middle_of(floor, surface)
+        assert z == pytest.approx(0.0)
+        if expected:
+            assert (x, y) == pytest.approx(expected, abs=0.01)
+        assert not (box[0] < x < box[2] and box[1] < y < box[3])
+    nothing = replace(surface, outer=ring[:2], holes=())
+    assert np.isnan(middle_of(floor, nothing)).all()
 
 
 def test_faces_turn_towards_the_side_that_was_seen():

@@ -53,7 +53,8 @@ class Rig:
         self.client = client
         self.snapshots = Snapshots("map")
         self.publisher = Publisher(service, "map", self.snapshots)
-        self.answers = Answers(service, "map", self.snapshots, {"pause": pause, "erase": refuse})
+        commands = {"export": export, "pause": export, "erase": refuse}
+        self.answers = Answers(service, "map", self.snapshots, commands)
         self.heard: list[zenoh.Sample] = []
         self.subscriber = client.declare_subscriber(
             "facet/v1/map/**", zenoh.handlers.Callback(self.heard.append, indirect=False)
@@ -92,8 +93,8 @@ def message(sample: zenoh.Sample) -> object:
     return decode(Envelope(str(sample.key_expr), schema, "protobuf", payload))
 
 
-def pause(parameters: Any) -> dict[str, Any]:
-    return {"paused": True, "for": parameters.get("for", "ever")}
+def export(parameters: Any) -> dict[str, Any]:
+    return {"format": parameters.get("format", "json")}
 
 
 def refuse(parameters: Any) -> dict[str, Any]:
@@ -192,10 +193,28 @@ def test_points_status_and_schema(rig: Rig) -> None:
 
 
 def test_commands_answer_or_name_the_cause(rig: Rig) -> None:
-    answer = rig.ask(f"{cmd_key('map', 'pause')}?for=lunch")
-    assert json.loads(answer.ok.payload.to_string()) == {"paused": True, "for": "lunch"}
+    answer = rig.ask(f"{cmd_key('map', 'export')}?format=ply")
+    assert json.loads(answer.ok.payload.to_string()) == {"format": "ply"}
     refused = rig.ask(cmd_key("map", "erase"))
     assert refused.err.payload.to_string() == "not supported: because"
+
+
+@pytest.mark.parametrize(
+    ("asked", "said"),
+    [
+        ("pause?now=1", "'now=1' is no parameter of pause, which takes none: leave it out"),
+        ("pause?now", "'now' is no parameter of pause, which takes none: leave it out"),
+        ("export?fromat=ply", "'fromat=ply' is no parameter of export, which takes format="),
+        ("export?format=ply;now=1", "'now=1' is no parameter of export, which takes format="),
+        ("export?format=", "format= has no value: give it one, or leave it out"),
+        ("export?format=ply;format=glb", "format= comes twice, 'ply' and 'glb': give it once"),
+    ],
+)
+def test_what_a_command_does_not_know_is_named(rig: Rig, asked: str, said: str) -> None:
+    name, _, parameters = asked.partition("?")
+    answer = rig.ask(f"{cmd_key('map', name)}?{parameters}")
+    assert answer.ok is None
+    assert answer.err.payload.to_string() == said
 
 
 def test_it_publishes_under_its_own_prefix_only(rig: Rig) -> None:

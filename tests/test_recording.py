@@ -6,15 +6,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from mcap.writer import Writer
 
 from facet.cuts import logged_cuts, timed_cuts
-from facet.sinks.log_file import write_recording
+from facet.sinks.log_file import schema_text, write_recording
 from facet.sources.mcap_damage import LogError
+from facet.sources.naming import is_input
 from facet.sources.recording import Recording, is_replayed, paced
 from facet_protocol import topics
 from facet_protocol.codec import encode
 from facet_protocol.messages import Cut, Envelope
 from rig import PERIOD_NS, room, unnumbered
+
+TRANSFORMS = "foxglove.FrameTransforms"
 
 
 def cut(revision: int, scan: Envelope) -> Envelope:
@@ -52,6 +56,29 @@ def test_files_follow_each_other(tmp_path: Path) -> None:
     write_recording(tmp_path / "a.mcap", scans[:2], {"map": "hall"})
     assert [e.sequence for e in Recording([tmp_path])] == [1, 2, 3, 4]
     assert Recording([tmp_path]).head() == {"map": "hall"}
+
+
+def foreign_transforms(path: Path) -> Path:
+    """A file that Foxglove's own library could have written: it says nothing of itself."""
+    with path.open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        schema = writer.register_schema(TRANSFORMS, *schema_text(TRANSFORMS))
+        channel = writer.register_channel(topics.TF_TOPIC, "protobuf", schema)
+        writer.add_message(channel, log_time=1, data=b"", publish_time=1)
+        writer.finish()
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.mcap", "z.mcap"])
+def test_what_a_file_says_of_itself_holds_for_no_other(tmp_path: Path, name: str) -> None:
+    """Transforms are Facet's own drawing in its own log, and an input in anyone else's."""
+    write_recording(tmp_path / "m.mcap", room(1), {"map": "hall", "cuts": "logged"})
+    foreign_transforms(tmp_path / name)
+    recording = Recording([tmp_path])
+    read = [(e.schema, is_input(e), recording.has_cuts) for e in recording]
+    ours, theirs = ("foxglove.PointCloud", True, True), (TRANSFORMS, True, False)
+    assert read == ([theirs, ours] if name < "m" else [ours, theirs])
 
 
 def test_what_is_no_log_is_refused(tmp_path: Path) -> None:

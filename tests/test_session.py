@@ -14,11 +14,15 @@ import trustme
 import zenoh
 
 from certificates import SECURE, Site
+from facet.commands.acknowledgements import Acknowledgements
 from facet.commands.play import RobotPublisher
+from facet.commands.talk import has_service
 from facet.config import ConfigError, NetworkSection, load_config
 from facet.session import client_settings, open_session, read_access_control, service_settings
 from facet.sources.live import Inbox, LiveSource
-from facet_protocol.messages import Envelope
+from facet_protocol import topics
+from facet_protocol.messages import Envelope, Status
+from facet_protocol.records import encode_status
 from rig import WAIT_S, free_endpoint, room, wait_until
 from tcp_proxy import Proxy
 
@@ -135,6 +139,32 @@ def test_what_a_robot_sent_in_vain_is_asked_for_through_the_same_door(
             network.restore()
             wait_until(lambda: taken() == list(range(1, 12)), 20)
             publisher.close()
+
+
+@pytest.mark.parametrize("kind", ["mtls", "users"])
+def test_a_robot_hears_what_was_taken(site: Site, kind: str) -> None:
+    """And nothing else that the service says."""
+    gauges = {"ack[r1/lidar]": 3.0, "ack_missing[r1/lidar]": 0.0, "ack_epoch[r1/lidar]": 7.0}
+    status = encode_status(Status("map", 1, 1, "OK", gauges=gauges))
+    settings = service_settings(load_config(site.settings(kind)).network)
+    heard: list[zenoh.Sample] = []
+    with open_session(settings) as service:
+        token = service.liveliness().declare_token(topics.alive_key("map"))
+        with client(site.endpoint, credentials_of(site, kind, "r1")) as robot:
+            updates = robot.declare_subscriber(topics.update_key("map"), heard.append)
+            acknowledged = Acknowledgements(robot, "map", epoch=7)
+            assert has_service(robot, "map")
+
+            def is_told() -> bool:
+                service.put(topics.update_key("map"), b"not for robots")
+                service.put(topics.status_key("map"), status)
+                return acknowledged.wait({"r1/lidar": 3}, 0.1) == 0
+
+            wait_until(is_told)
+            acknowledged.close()
+            updates.undeclare()
+        token.undeclare()
+    assert heard == []
 
 
 @pytest.mark.parametrize("kind", ["mtls", "users"])

@@ -23,7 +23,14 @@ STATUS_TOPIC = "/facet/status"
 LOSS_TOPIC = "/facet/loss"
 TF_TOPIC = "/tf"
 
-COMMANDS = ("pause", "resume", "checkpoint", "export", "erase", "record")
+COMMANDS: dict[str, tuple[str, ...]] = {  # and the parameters that each takes
+    "pause": (),
+    "resume": (),
+    "checkpoint": (),
+    "export": ("format",),
+    "erase": ("robot", "sensor", "epoch", "first", "last"),
+    "record": (),
+}
 
 _ID = re.compile(r"[A-Za-z0-9_-]{1,64}")
 _SCAN_KEY = re.compile(rf"{PREFIX}/([^/]+)/robot/([^/]+)/scan/([^/]+)")

@@ -16,8 +16,8 @@ from facet.status import Account
 from facet_protocol import topics
 from facet_protocol.messages import Corrected, Envelope, Erase, ProtocolError
 
-PARAMETERS = ("robot", "sensor", "epoch", "first", "last")
 ANSWER_S = 10.0
+MAX_DIGITS = 20
 MAX_NUMBER = {"epoch": (1 << 32) - 1, "first": (1 << 64) - 1, "last": (1 << 64) - 1}
 
 
@@ -69,9 +69,6 @@ class Erasing:
 
 def _erase_of(parameters: Mapping[str, str]) -> Erase:
     """Raises CommandError."""
-    for name in parameters:
-        if name not in PARAMETERS:
-            raise CommandError(f"{name}= is not one of {', '.join(PARAMETERS)}")
     if not parameters.get("robot"):
         raise CommandError("whose scans? say robot=NAME")
     try:
@@ -80,11 +77,16 @@ def _erase_of(parameters: Mapping[str, str]) -> Erase:
                 topics.check_id(parameters[name])
     except ProtocolError as error:
         raise CommandError(str(error)) from error
-    numbers = [_number(name, parameters.get(name, "0")) for name in MAX_NUMBER]
-    return Erase(parameters["robot"], parameters.get("sensor", ""), *numbers)
+    numbers = {name: _number(name, parameters[name]) for name in MAX_NUMBER if name in parameters}
+    erase = Erase(parameters["robot"], parameters.get("sensor", ""), **numbers)
+    if erase.last and erase.first > erase.last:
+        raise CommandError(f"first={erase.first} comes after last={erase.last}")
+    return erase
 
 
 def _number(name: str, text: str) -> int:
-    if not text.isascii() or not text.isdecimal() or int(text) > MAX_NUMBER[name]:
-        raise CommandError(f"{name}={text!r} is not a number from 0 to {MAX_NUMBER[name]}")
+    """From 1: none of them is ever 0, which in an `Erase` stands for all."""
+    is_number = text.isascii() and text.isdecimal() and len(text) <= MAX_DIGITS
+    if not is_number or not 1 <= int(text) <= MAX_NUMBER[name]:
+        raise CommandError(f"{name}={text[:80]!r} is not a number from 1 to {MAX_NUMBER[name]}")
     return int(text)

@@ -117,6 +117,7 @@ class Intake:
         self._commit_s, self._retry_s = commit_s, retry_s
         self._exit_on_failure = exit_on_failure
         self._ledger = SequenceLedger()
+        self._shed: Counter[tuple[str, int]] = Counter()  # by source and epoch
         self._derived: deque[Addressed | threading.Event] = deque()
         self._said: list[Addressed] = []  # written, not yet durable: for the follower
         self._took_s = 0.0  # the last commit
@@ -257,6 +258,7 @@ class Intake:
         """What the inbox had to drop did arrive: it is no loss upstream."""
         source = f"{loss.robot}/{loss.sensor}"
         if loss.first_sequence:
+            self._shed[source, loss.epoch] += loss.count
             for sequence in range(loss.first_sequence, loss.first_sequence + loss.count):
                 noted = self._ledger.note(source, loss.epoch, sequence)
                 if noted.skipped:
@@ -302,18 +304,21 @@ class Intake:
             if self.follower is not None:
                 self.follower.write(envelope, message)
         scans, self._scans = self._scans, []
-        recorded, newest = Counter[str](), dict[str, int]()
-        for envelope in scans:
-            source = source_of(envelope)
-            recorded[source] += 1
-            newest[source] = envelope.sequence
-        for source, num in recorded.items():
+        for source, num in Counter(map(source_of, scans)).items():
             self._account.count("recorded", source, num)
-            self._account.gauge("ack", newest[source], source)
+            self._acknowledge(source)
         if scans:
             position = self._recorder.position
             self._note_past(scans, position)
             self._durable.put(scans, position)
+
+    def _acknowledge(self, source: str) -> None:
+        """All that was noted is in the log now, up to the newest number of its epoch, but for what
+        is missing. In this order: who reads between two of them is told too little."""
+        epoch, newest, missing = self._ledger.newest(source)
+        missing += self._shed[source, epoch]
+        for name, value in {"ack_missing": missing, "ack": newest, "ack_epoch": epoch}.items():
+            self._account.gauge(name, value, source)
 
     def _note_past(self, scans: list[Envelope], position: LogPosition) -> None:
         last, self._written_to = self._written_to, position

@@ -142,5 +142,11 @@ class SequenceLedger:
         sources = sorted(self._skipped) if source is None else [source]
         return {s: self._skipped[s] - self._late[s] for s in sources}
 
+    def newest(self, source: str) -> tuple[int, int, int]:
+        """(epoch, newest number, how many before it are missing) of its last message's epoch."""
+        epoch = self._current.get(source, 0)
+        numbers = self._seen.get(source, {}).get(epoch, Numbers())
+        return epoch, numbers.last, numbers.missing
+
     def num_epochs(self) -> dict[str, int]:
         return {source: len(epochs) for source, epochs in sorted(self._seen.items())}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated
 
@@ -11,8 +11,9 @@ import typer
 import zenoh
 import zenoh.ext
 
-from facet.commands.talk import CredentialsOption, maps_at, no_service
-from facet.commands.terminal import err, existing, out, progress
+from facet.commands.acknowledgements import PATIENCE_S, Acknowledgements
+from facet.commands.talk import CredentialsOption, has_service, maps_at, no_service
+from facet.commands.terminal import Exit, err, existing, out, progress, said_if_slow
 from facet.session import DEFAULT_ENDPOINT, client_settings, open_session
 from facet.sources.naming import (
     TRANSFORM_SCHEMAS,
@@ -22,6 +23,7 @@ from facet.sources.naming import (
     is_static,
     names_of,
     pose_frame,
+    source_of,
 )
 from facet.sources.recording import Recording
 from facet_protocol import attachment
@@ -39,7 +41,7 @@ class RobotPublisher:
 
     def __init__(self, session: zenoh.Session, map_id: str) -> None:
         self._session, self._map_id = session, map_id
-        self._epoch = time.time_ns() // 1_000_000 & 0xFFFFFFFF  # a new one at each start
+        self.epoch = time.time_ns() // 1_000_000 & 0xFFFFFFFF  # a new one at each start
         self._publishers: dict[str, zenoh.ext.AdvancedPublisher] = {}
         self._sequences: dict[str, int] = {}
 
@@ -52,8 +54,13 @@ class RobotPublisher:
         self._publishers[key].put(
             bytes(envelope.payload),
             encoding=f"application/{envelope.encoding};{envelope.schema}",
-            attachment=attachment.pack(self._epoch, sequence, envelope.stamp_ns),
+            attachment=attachment.pack(self.epoch, sequence, envelope.stamp_ns),
         )
+
+    @property
+    def sent(self) -> dict[str, int]:
+        """How many messages, by source."""
+        return {source_of(key): num for key, num in self._sequences.items()}
 
     def close(self) -> None:
         """Stay as long as a heartbeat takes: what is missing at the end can still be asked for."""
@@ -141,12 +148,15 @@ def play(
     """Publish a recording over Zenoh, as the robot would.
 
     Recordings of ROS 2 too, with their transforms. Scans get new numbers, so corrections of poses,
-    which name the old ones, are not sent.
+    which name the old ones, are not sent. At the end it stays until the service has acknowledged
+    all of it, also over a link that comes back.
 
     \b
     facet run &                                    # somebody has to listen
     facet play recordings/office-pushbroom.mcap    # as it was recorded
     facet play a.mcap --robot second --speed 10    # another robot, ten times as fast
+
+    Exit code 3: not all of it was acknowledged, after a minute and a half without news.
     """
     rate = parse_speed(speed)
     if robot is not None:
@@ -157,14 +167,40 @@ def play(
         maps = maps_at(session)
         if maps and map_id not in maps:  # behind an access table nothing may be seen
             err.print(no_service(session, map_id, connect))
+        is_there = has_service(session, map_id)
         publisher = RobotPublisher(session, map_id)
+        service = Acknowledgements(session, map_id, publisher.epoch)
         num = 0
         try:
             for num in play_scans(filter(is_input, recording), publisher, robot, rate):
                 bar.update(bar.task_ids[0], completed=num)
+            is_there = is_there or service.is_heard or has_service(session, map_id)
+            left = _wait_until_taken(service, publisher.sent) if is_there else 0
         finally:
+            service.close()
             publisher.close()
-    out.print(f"played {num:,} scans")
+    _conclude(num, publisher.sent, left if is_there else None)
+
+
+def _wait_until_taken(service: Acknowledgements, sent: Mapping[str, int]) -> int:
+    """How many messages a service that is there does not acknowledge."""
+    num = sum(sent.values())
+    with said_if_slow(f"sent {num:,} messages; waiting until all are acknowledged", err.print):
+        return service.wait(sent, PATIENCE_S)
+
+
+def _conclude(num_scans: int, sent: Mapping[str, int], left: int | None) -> None:
+    """The last word; `left` None: nobody acknowledges."""
+    out.print(f"played {num_scans:,} scans")
+    if left is None:
+        err.print("nobody there acknowledges: whether all of them were taken is not known")
+    elif left:
+        num = sum(sent.values())
+        err.print(
+            f"{left:,} of {num:,} messages were not acknowledged: those may be lost; "
+            "`facet status` tells how the service is"
+        )
+        raise typer.Exit(Exit.LOST)
 
 
 def parse_speed(text: str) -> float:

@@ -18,6 +18,7 @@ from facet.commands.settings import (
     StrictOption,
     ThetaOption,
     VoxelOption,
+    load_loops,
     make_mapper,
     mapping_overrides,
     recorded_settings,
@@ -99,6 +100,7 @@ def replay_log(
     past = Past(dialects_of(config.robots))
     recording = Recording(logs, dialects_of(config.robots), past.note_read)
     mapper = make_mapper(config, recorded_settings(head))
+    load_loops(mapper.settings)
     account = Account()
     from facet.pipeline import Pipeline
 

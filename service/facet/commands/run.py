@@ -22,6 +22,7 @@ from facet.commands.settings import (
     StrictOption,
     ThetaOption,
     VoxelOption,
+    load_loops,
     make_mapper,
     mapping_overrides,
     robots_overrides,
@@ -39,7 +40,6 @@ if TYPE_CHECKING:
 logger = logging.getLogger(__name__)
 
 WATCH_S = 0.5
-PATIENCE_S = 5.0  # from the cache it takes one
 VIEWER_EXIT_S = 1.5
 
 
@@ -120,14 +120,12 @@ def serve(config: Config) -> Exit:
     from facet.resume import Stopped
     from facet.service import ACKNOWLEDGED, Service
     from facet.sinks.recorder import single_writer
-    from facet.warmup import warm_up
 
     if config.record.directory.is_file():
         raise InputError(f"{config.record.directory} is a file: the log needs a folder")
     mapper = make_mapper(config)
     with single_writer(config.record.directory), stop_signals() as stop:
-        with _said_if_slow("compiling the mapper's loops, once: this takes a minute or two"):
-            warm_up(mapper.settings)
+        load_loops(mapper.settings, logger.info)
         try:
             resumed = _resume(config, mapper, stop)
         except Stopped:
@@ -145,17 +143,6 @@ def serve(config: Config) -> Exit:
                 if model is not None:
                     write_model(model, config.record.directory / "model.json")
         return _conclude(service, model)
-
-
-@contextmanager
-def _said_if_slow(text: str) -> Iterator[None]:
-    """Log the text when what is done takes longer than PATIENCE_S."""
-    timer = threading.Timer(PATIENCE_S, logger.info, (text,))
-    timer.start()
-    try:
-        yield
-    finally:
-        timer.cancel()
 
 
 def _resume(config: Config, mapper: Mapper, stop: threading.Event) -> Resumed:

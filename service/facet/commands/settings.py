@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import cache
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from facet.commands.terminal import err, said_if_slow
 from facet.config import Config, ConfigError
 
 if TYPE_CHECKING:
     from facet.mapping.mapper import Mapper
+    from facet.mapping.settings import MapSettings
     from facet.paging import PagedMemory
 
 logger = logging.getLogger(__name__)
@@ -74,6 +77,16 @@ def make_mapper(config: Config, recorded: Mapping[str, Any] | None = None) -> Ma
     except (TypeError, ValueError) as error:
         raise ConfigError(str(error)) from error
     return Mapper(settings, config.map.id, _memory(config))
+
+
+@cache
+def load_loops(settings: MapSettings, say: Callable[[str], object] = err.print) -> None:
+    """The mapper's compiled loops, once a process: from the cache in a second, else it is said
+    that they have to be compiled."""
+    from facet.warmup import warm_up
+
+    with said_if_slow("compiling the mapper's loops, once: this takes a minute or two", say):
+        warm_up(settings)
 
 
 def _memory(config: Config) -> PagedMemory | None:

@@ -57,6 +57,12 @@ def maps_at(session: zenoh.Session) -> list[str]:
     return sorted({str(r.ok.key_expr).split("/")[place] for r in replies if r.ok is not None})
 
 
+def has_service(session: zenoh.Session, map_id: str) -> bool:
+    """Whether somebody makes this map; an access table may hide the others."""
+    replies = session.liveliness().get(topics.alive_key(map_id), timeout=WAIT_S)
+    return any(reply.ok is not None for reply in replies)
+
+
 def no_service(session: zenoh.Session, map_id: str, endpoint: str) -> str:
     """That nobody makes this map, and which maps somebody makes."""
     maps = maps_at(session)

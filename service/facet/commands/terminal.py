@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import logging
 import sys
-from collections.abc import Iterable, Iterator
+import threading
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from enum import IntEnum
 from pathlib import Path
@@ -14,6 +15,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 from rich.text import Text
 
+PATIENCE_S = 5.0  # without a word
 PIPE_WIDTH = 200  # columns: in a pipe nothing is folded, so that it can be searched
 out = Console(highlight=False, soft_wrap=True, width=None if sys.stdout.isatty() else PIPE_WIDTH)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -74,6 +76,17 @@ def progress(what: str, total: float | None = None) -> Iterator[Progress]:
     with Progress(*columns, console=err, disable=not err.is_terminal, transient=True) as bar:
         bar.add_task(what, total=total)
         yield bar
+
+
+@contextmanager
+def said_if_slow(text: str, say: Callable[[str], object]) -> Iterator[None]:
+    """Say the text when what is done takes longer than PATIENCE_S."""
+    timer = threading.Timer(PATIENCE_S, say, (text,))
+    timer.start()
+    try:
+        yield
+    finally:
+        timer.cancel()
 
 
 def existing(paths: Iterable[Path]) -> list[Path]:

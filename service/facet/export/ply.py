@@ -25,7 +25,8 @@ def write_points(planes: Sequence[Plane], tiles: Sequence[TilePoints], path: Pat
     """One vertex a voxel: its centroid, its plane's inward normal and id (0 on no plane)."""
     ids = np.concatenate([tile.plane_ids for tile in tiles])
     xyz = np.concatenate([tile.xyz() for tile in tiles])
-    vertices = _vertices(xyz, _normals(planes, ids), point_colours(ids), ids)
+    colours = point_colours(ids, {plane.id: plane.plane_class for plane in planes})
+    vertices = _vertices(xyz, _normals(planes, ids), colours, ids)
     _write([PlyElement.describe(vertices, "vertex")], path)
 
 

@@ -49,6 +49,18 @@ def surface_triangles(
     return plane.lift(vertices), faces
 
 
+def middle_of(plane: Plane, surface: Surface) -> NDArray[np.float64]:
+    """(3,) m, world: the surface's centroid, or where that is in none of it, a point that is. NaN
+    when it has no area."""
+    area = polygon(surface.outer, [hole.ring for hole in surface.holes])
+    middle = shapely.centroid(area)
+    if not shapely.contains(area, middle):
+        middle = shapely.point_on_surface(area)
+    if shapely.is_empty(middle):
+        return np.full(3, np.nan)
+    return np.asarray(plane.lift(shapely.get_coordinates(middle))[0])
+
+
 def inward_normal(plane: Plane) -> NDArray[np.float64]:
     """(3,) unit, world: towards the side from which the plane was seen."""
     return np.asarray(plane.facing * plane.normal)

@@ -47,7 +47,7 @@ class Answers:
         ]
         for name, command in commands.items():
             key = topics.cmd_key(map_id, name)
-            self._queryables.append(self._declare(session, key, self._obey(key, command)))
+            self._queryables.append(self._declare(session, key, self._obey(name, key, command)))
         self._thread = threading.Thread(target=self._run, name="answers", daemon=True)
         self._thread.start()
 
@@ -98,16 +98,33 @@ class Answers:
         encoding = encoding_of("google.protobuf.FileDescriptorSet")
         query.reply(topics.schema_key(self._map_id), facet_descriptors(), encoding=encoding)
 
-    def _obey(self, key: str, command: Command) -> Callable[[Any], None]:
+    def _obey(self, name: str, key: str, command: Command) -> Callable[[Any], None]:
         def answer(query: Any) -> None:
             try:
-                result = command(dict(query.parameters))
+                result = command(parameters_of(name, str(query.parameters)))
             except CommandError as error:
                 _refuse(query, str(error))
                 return
             query.reply(key, json.dumps(result), encoding=zenoh.Encoding.APPLICATION_JSON)
 
         return answer
+
+
+def parameters_of(command: str, text: str) -> dict[str, str]:
+    """Those of `a=1;b=2`. Raises CommandError for one that the command does not take, that has no
+    value, or that comes twice: what was not understood is not done by half."""
+    known, found = topics.COMMANDS[command], dict[str, str]()
+    for part in filter(None, text.split(";")):
+        name, _, value = part.partition("=")
+        if name not in known:
+            takes = ", ".join(f"{name}=" for name in known) or "none: leave it out"
+            raise CommandError(f"{part!r} is no parameter of {command}, which takes {takes}")
+        if not value:
+            raise CommandError(f"{name}= has no value: give it one, or leave it out")
+        if name in found:
+            raise CommandError(f"{name}= comes twice, {found[name]!r} and {value!r}: give it once")
+        found[name] = value
+    return found
 
 
 def _refuse(query: Any, text: str) -> None:

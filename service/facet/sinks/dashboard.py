@@ -137,7 +137,8 @@ class Dashboard:
             self._log_number(f"gauges/{name}", value)
         if status.health != self._health:
             level = rr.TextLogLevel.INFO if status.health == "OK" else rr.TextLogLevel.WARN
-            self._stream.log("events/health", rr.TextLog(f"health {status.health}", level=level))
+            line = drawing.line(f"health {status.health}", status.stamp_ns, level)
+            self._stream.log("events/health", line)
             self._health = status.health
 
     def flush(self) -> None:
@@ -183,14 +184,16 @@ class Dashboard:
         mesh = drawing.mesh(plane)
         self._stream.log(f"{entity}/surface", mesh or rr.Clear(recursive=False))
         self._stream.log(f"{entity}/outline", drawing.outline(plane))
+        self._stream.log(f"{entity}/name", drawing.label(plane) or rr.Clear(recursive=False))
 
     def _draw_tiles(self) -> None:
+        classes = {i: plane.plane_class for i, plane in self._planes.items()}
         overhead = [i for i, plane in self._planes.items() if is_overhead(plane)]
         for key, tile in sorted(self._waiting_tiles.items()):
             name = "_".join(str(k) for k in key)
             below, above = drawing.split_tile(tile, overhead)
             for kind, rows in (("below", below), (layout.OVERHEAD, above)):
-                self._stream.log(f"map/points/{kind}/{name}", drawing.points(*rows))
+                self._stream.log(f"map/points/{kind}/{name}", drawing.points(*rows, classes))
         self._waiting_tiles.clear()
 
     def _fit_view(self) -> None:
@@ -224,12 +227,17 @@ class Dashboard:
             if event.kind is EventKind.UPDATED:
                 num_updated += 1
                 continue
-            plane = self._planes.get(event.plane_id) or gone.get(event.plane_id)
-            text = drawing.event_text(event, plane)
-            self._stream.log("events", rr.TextLog(text, level=rr.TextLogLevel.INFO))
+            plane, other = (
+                self._planes.get(i) or gone.get(i) for i in (event.plane_id, event.other_id)
+            )
+            text = drawing.event_text(event, plane, other)
+            colours = (drawing.colour_of(plane),) if plane else ()
+            line = drawing.line(text, event.stamp_ns, rr.TextLogLevel.INFO, *colours)
+            self._stream.log("events", line)
         if num_updated:
             text = f"{num_updated} planes updated, revision {update.revision}"
-            self._stream.log("events", rr.TextLog(text, level=rr.TextLogLevel.DEBUG))
+            line = drawing.line(text, update.stamp_ns, rr.TextLogLevel.DEBUG)
+            self._stream.log("events", line)
 
 
 def _leaves(box: NDArray[np.float64], fitted: NDArray[np.float64]) -> bool:
@@ -239,8 +247,8 @@ def _leaves(box: NDArray[np.float64], fitted: NDArray[np.float64]) -> bool:
 
 
 def _entity(plane: Plane) -> str:
-    kind = layout.OVERHEAD if is_overhead(plane) else plane.plane_class.value
-    return f"map/planes/{kind}/{plane.id}"
+    above = f"{layout.OVERHEAD}/" if is_overhead(plane) else ""
+    return f"map/planes/{above}{plane.plane_class.value}/{plane.id}"
 
 
 class RrdViewer:

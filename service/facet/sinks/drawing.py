@@ -2,18 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from facet.export.colours import CLASS_COLOURS, HOLE_COLOURS, plane_colour, point_colours
-from facet.export.triangles import inward_normal, surface_triangles
+from facet.export.colours import (
+    CLASS_COLOURS,
+    HOLE_COLOURS,
+    UNASSIGNED,
+    plane_colour,
+    point_colours,
+)
+from facet.export.triangles import inward_normal, middle_of, surface_triangles
 from facet_protocol.messages import (
     Event,
     EventKind,
     Plane,
+    PlaneClass,
     Pose,
     TilePoints,
 )
@@ -21,6 +28,7 @@ from facet_protocol.messages import (
 MESH_ALPHA = 170
 SAME_M, SAME_NORMAL = 1e-3, 1e-4
 POINT_RADIUS = rr.Radius.ui_points(0.9)
+LABEL_AREA_M2 = 2.0  # what is smaller has its name where the pointer is: names hide what is behind
 PATH_COLOUR = (255, 214, 64)
 ROBOT_COLOUR = (255, 120, 40)
 
@@ -42,7 +50,31 @@ def mesh(plane: Plane) -> rr.Mesh3D | None:
         vertex_positions=positions,
         triangle_indices=np.concatenate(faces),
         vertex_normals=normals,
-        albedo_factor=(*plane_colour(plane.id), MESH_ALPHA),
+        albedo_factor=(*colour_of(plane), MESH_ALPHA),
+    )
+
+
+def name_of(plane: Plane) -> str:
+    """What it is called on the screen and among the events: `wall 12`."""
+    return f"{plane.plane_class.value} {plane.id}"
+
+
+def colour_of(plane: Plane) -> tuple[int, int, int]:
+    return plane_colour(plane.id, plane.plane_class)
+
+
+def label(plane: Plane) -> rr.Points3D | None:
+    """Its name, in the middle of its largest surface; None where it has no area."""
+    surface = max(plane.surfaces, key=lambda s: s.area_m2, default=None)
+    middle = middle_of(plane, surface) if surface is not None else np.full(3, np.nan)
+    if not np.isfinite(middle).all():
+        return None
+    return rr.Points3D(
+        [middle],
+        labels=[name_of(plane)],
+        show_labels=sum(s.area_m2 for s in plane.surfaces) >= LABEL_AREA_M2,
+        colors=colour_of(plane),
+        radii=rr.Radius.ui_points(0.0),
     )
 
 
@@ -50,7 +82,7 @@ def outline(plane: Plane) -> rr.LineStrips3D:
     """Outer rings in the plane's colour, openings and unobserved holes each in their own."""
     strips, colours = [], []
     for surface in plane.surfaces:
-        rings = [(surface.outer, plane_colour(plane.id))]
+        rings = [(surface.outer, colour_of(plane))]
         rings += [(hole.ring, HOLE_COLOURS[hole.kind]) for hole in surface.holes]
         for ring, colour in rings:
             p = plane.lift(ring)
@@ -61,9 +93,11 @@ def outline(plane: Plane) -> rr.LineStrips3D:
     return rr.LineStrips3D(strips, colors=colour_rows, radii=rr.Radius.ui_points(1.6))
 
 
-def points(xyz: NDArray[np.float32], plane_ids: NDArray[np.int32]) -> rr.Points3D:
+def points(
+    xyz: NDArray[np.float32], plane_ids: NDArray[np.int32], classes: Mapping[int, PlaneClass]
+) -> rr.Points3D:
     """(V, 3) m coloured by plane."""
-    rgb = point_colours(plane_ids).astype(np.uint32)
+    rgb = point_colours(plane_ids, classes).astype(np.uint32)
     packed = (rgb[:, 0] << 24) | (rgb[:, 1] << 16) | (rgb[:, 2] << 8) | np.uint32(255)
     return rr.Points3D(xyz, colors=packed, radii=POINT_RADIUS)
 
@@ -103,15 +137,28 @@ def curve(name: str) -> rr.SeriesLines:
     return rr.SeriesLines(names=name, widths=1.8, colors=kinds.get(name))
 
 
-def event_text(event: Event, plane: Plane | None) -> str:
-    """One line: `wall 12 created, 11.9 m²`."""
-    name = f"{plane.plane_class.value if plane else 'plane'} {event.plane_id}"
+def line(
+    text: str,
+    stamp_ns: int,
+    level: rr.TextLogLevel = rr.TextLogLevel.INFO,
+    colour: tuple[int, int, int] = UNASSIGNED,
+) -> rr.TextLog:
+    """One among the events, `22:13:55 wall 12 created`, in the colour of its plane. A line without
+    a colour of its own would have that of the line before."""
+    time = str(np.datetime64(stamp_ns, "ns").astype("datetime64[s]")).partition("T")[2]
+    return rr.TextLog(f"{time} {text}", level=level, color=colour)
+
+
+def event_text(event: Event, plane: Plane | None, other: Plane | None) -> str:
+    """One line: `wall 12 created, 11.9 m²`; planes by the names that they have on the screen."""
+    name = name_of(plane) if plane else f"plane {event.plane_id}"
+    other_name = name_of(other) if other else f"plane {event.other_id}"
     area = f", {sum(s.area_m2 for s in plane.surfaces):.1f} m²" if plane else ""
     match event.kind:
         case EventKind.MERGED:
-            return f"{name} merged into {event.other_id}"
+            return f"{name} merged into {other_name}"
         case EventKind.SPLIT:
-            return f"{name} split from {event.other_id}{area}"
+            return f"{name} split from {other_name}{area}"
         case EventKind.CREATED:
             return f"{name} created{area}"
         case _:

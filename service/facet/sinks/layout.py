@@ -73,10 +73,11 @@ def _whole() -> rrb.Spatial3DView:
 
 
 def _event_columns() -> rrb.TextLogColumns:
-    """When, and what; of the columns that a log view knows."""
+    """The text alone: it says the time, of which a column of its own would show the year."""
     kinds = rrb.encodings.TextLogColumnKind
     columns = [rrb.encodings.TextLogColumn(kind, visible=kind == kinds.Body) for kind in kinds]
-    return rrb.TextLogColumns(text_log_columns=columns)
+    stamps = [rrb.encodings.TimelineColumn(TIMELINE, visible=False)]
+    return rrb.TextLogColumns(timeline_columns=stamps, text_log_columns=columns)
 
 
 def _eye(planes: Sequence[Plane]) -> rrb.EyeControls3D | None:

@@ -34,7 +34,7 @@ class Recording:
     def __iter__(self) -> Iterator[Envelope]:
         for path in self.paths:
             stream = McapStream(path)
-            self.damage[path] = stream.damage
+            self.damage[path], self.metadata = stream.damage, {}
             for message in stream.messages():
                 self.metadata.update((m.name, m.metadata) for m in stream.metadata)
                 stream.metadata.clear()
