@@ -13,7 +13,7 @@ from facet.mapping import contours, describe
 from facet.mapping.mapper import Mapper
 from facet.mapping.quantise import Ticks
 from facet.mapping.settings import TICKS
-from facet.mapping.store import VoxelStore
+from facet.mapping.store import Dirty, VoxelStore
 from facet_protocol.maps import encode_update
 from facet_protocol.messages import HoleKind, MapUpdate, Scan
 from mapping_logs import cloud, keeps_order, log, mapped, undoes, wall
@@ -152,13 +152,12 @@ def remembering(patch: Patch, keep: Keep) -> None:
     """Voxels whose old and new observables (D,) `keep` accepts keep the old one."""
     settle = VoxelStore.settle
 
-    def settles(self: VoxelStore) -> NDArray[np.int32]:
-        before = self.columns.observable.copy()
-        dirty = settle(self)
-        old, new = before[dirty], self.columns.observable[dirty]
+    def settles(self: VoxelStore) -> Dirty:
+        rows, old = settle(self)
+        new = self.columns.observable[rows]
         still = np.asarray(keep(old, new)) & (old != 0) & (new != 0)
-        self.columns.observable[dirty[still]] = old[still]
-        return dirty[~still]
+        self.columns.observable[rows[still]] = old[still]
+        return Dirty(rows[~still], old[~still])
 
     patch.setattr(VoxelStore, "settle", settles)
 

@@ -56,7 +56,7 @@ def counts(seen: int, word: int, offset: NDArray[np.int64], key: int) -> bool:
     rule = make_rule(SETTINGS)
     half = rule.slab if kind == SLAB else rule.thin_slab
     away = int(normal @ (8 * offset + centroid(word) - centroid(seen)))
-    return abs(away) <= half and int(normal @ view(word)) > 0
+    return abs(away) < half and int(normal @ view(word)) > 0
 
 
 def plain_sum(votes: Votes, at: tuple[int, int, int], key: int) -> list[int]:

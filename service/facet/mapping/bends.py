@@ -41,7 +41,7 @@ EMPTY = 0.8  # bimodality across a strip: 1 of two lines, 0.56 where it is fille
 GAP_WIDTH = 4.0  # voxels: a narrower strip has no place for that
 
 
-@kernel
+@kernel(allocates=False)
 def _is_pure(normals, patches, row):  # type: ignore[no-untyped-def]
     """Whether a voxel has a normal that no other surface turned."""
     return patches.member[row] >= 0 and not normals.border[row] and patches.second[row] < 0
@@ -95,7 +95,7 @@ def _pool(sums, corner, nodes, label, origin, out):  # type: ignore[no-untyped-d
                 out[k, 13 + 3 * a + b] += own[13 + 3 * a + b] + own[10 + a] * d[b]
 
 
-@kernel
+@kernel(allocates=False)
 def _add_heights(store, normals, patches, rows, plane_of, origin, axes, pure, sums):  # type: ignore[no-untyped-def]
     """Likewise add to sums (K, ARC) where members are across the strip, and how far off its plane.
     axes: (K, 6) unit vectors across it and along its normal; pure: (K,) of pure members alone."""

@@ -42,7 +42,7 @@ def pack_all(ijk: Int64Array) -> Int64Array:
     return np.asarray((i << 42) | (j << 21) | k, dtype=np.int64)
 
 
-@kernel
+@kernel(allocates=False)
 def hash_key(key: Any) -> Any:
     """A 63-bit mix (splitmix64's finaliser)."""
     z = np.uint64(key)
@@ -64,7 +64,7 @@ def find(table_keys: Int64Array, table_values: NDArray[np.int32], key: Any) -> A
         slot = (slot + 1) & mask
 
 
-@kernel
+@kernel(allocates=False)
 def put(table_keys: Int64Array, table_values: NDArray[np.int32], key: int, value: int) -> None:
     """Store a key that is not in the table yet."""
     mask = table_keys.shape[0] - 1
@@ -105,7 +105,7 @@ def row_at(blocks: Blocks, block: int, local: int) -> Any:
     return blocks.rows[blocks.lines[block, local >> 3], local & 7] - 1
 
 
-@kernel
+@kernel(allocates=False)
 def put_row(blocks: Blocks, num_lines: int, block: int, local: int, row: int) -> int:
     """Enter a voxel's row, line `num_lines` being the first that is free. Returns the next one."""
     line = blocks.lines[block, local >> 3]
@@ -117,7 +117,7 @@ def put_row(blocks: Blocks, num_lines: int, block: int, local: int, row: int) ->
     return num_lines
 
 
-@kernel
+@kernel(allocates=False)
 def add_block(blocks: Blocks, count: int, key: int) -> int:
     """Append the block `key` as number `count` and link it with its neighbours. Returns `count`."""
     blocks.keys[count] = key

@@ -39,7 +39,7 @@ class Share(NamedTuple):
     places: list[int]  # of the (u, v) tiles that they fall into
 
 
-@kernel
+@kernel(allocates=False)
 def _project(rows, block, size, blocks, columns, axes, out):  # type: ignore[no-untyped-def]
     """(u, v) in grid units of the voxels of runs, into out (N, 2)."""
     m = 0
@@ -55,7 +55,7 @@ def _project(rows, block, size, blocks, columns, axes, out):  # type: ignore[no-
             m += 1
 
 
-@kernel
+@kernel(allocates=False)
 def _share(uv, points, corner, places):  # type: ignore[no-untyped-def]
     """Points (N, 2) from their least corner, given as (N, 2) uv, and the places of the (u, v) tiles
     that they fall into, each once. Returns how many."""
@@ -96,7 +96,7 @@ def share_all(  # type: ignore[no-untyped-def]
                 num_places[s] = _share(uv, points[low:high], corners[s], places[s])
 
 
-@kernel
+@kernel(allocates=False)
 def _paint(points, corner, place, cells):  # type: ignore[no-untyped-def]
     """Set the bits of the points (N, 2), relative to a corner, that lie in a (u, v) tile."""
     tile_u, tile_v = _tile_at(place)
@@ -108,14 +108,14 @@ def _paint(points, corner, place, cells):  # type: ignore[no-untyped-def]
             cells[v >> 3, u >> 3] |= bit
 
 
-@kernel
+@kernel(allocates=False)
 def _tile_at(place):  # type: ignore[no-untyped-def]
     """(tile_u, tile_v) of a place."""
     tile_u = (place + RIGHT // 2) // RIGHT
     return tile_u, place - tile_u * RIGHT
 
 
-@kernel
+@kernel(allocates=False)
 def _put(places, words, row, column, window):  # type: ignore[no-untyped-def]
     """Copy the cells of a tile that begins at (row, column) of a window, as far as they lie in
     it."""
@@ -125,7 +125,7 @@ def _put(places, words, row, column, window):  # type: ignore[no-untyped-def]
             window[r, c] = words[n]
 
 
-@kernel
+@kernel(allocates=False)
 def _any(marked, rows, columns):  # type: ignore[no-untyped-def]
     """Whether any of a part of the cells is marked."""
     for row in range(rows[0], rows[1]):
@@ -165,7 +165,7 @@ def _touch(old, cells, marked, touched):  # type: ignore[no-untyped-def]
         touched[part] = found and _any(marked, _PARTS[part // 3], _PARTS[part % 3])
 
 
-@kernel
+@kernel(allocates=False)
 def _list_cells(cells, places, words):  # type: ignore[no-untyped-def]
     """List the cells that hold points. How many."""
     count = 0
@@ -185,7 +185,7 @@ def part_of(marked: NDArray[np.bool_], part: int, wanted: NDArray[np.bool_]) -> 
     own |= marked[top:bottom, left:right]
 
 
-@kernel
+@kernel(allocates=False)
 def _fill_window(places, words, starts, around, window):  # type: ignore[no-untyped-def]
     """Copy a tile and its halo into a window (SIDE, SIDE)."""
     window[:] = np.uint64(0)
@@ -244,7 +244,7 @@ def replace_edges(tiles, old, old_starts, new, new_starts, wanted, edges, counts
         counts[n], same[n] = _replace(tiles[n], before, found, wanted[n], own)
 
 
-@kernel
+@kernel(allocates=False)
 def _edge_key(u, v, to_u, to_v):  # type: ignore[no-untyped-def]
     """Edges of a tile are in the order of these keys: by v', u', v, u."""
     return ((np.int64(to_v) + SIZE) << 40) | ((np.int64(to_u) + SIZE) << 20) | (v << 10) | u

@@ -80,7 +80,7 @@ class Census:
         )
 
 
-@kernel
+@kernel(allocates=False)
 def _fill(blocks, observable, label, id_of_patch, which, tile, centroids, ids):  # type: ignore[no-untyped-def]
     count = 0
     for q in range(which.shape[0]):

@@ -63,7 +63,7 @@ def _make_scratch(per_block):  # type: ignore[no-untyped-def]
     return found, voxels
 
 
-@kernel
+@kernel(allocates=False)
 def _gather(blocks, observable, member, block, voxels):  # type: ignore[no-untyped-def]
     """List the voxels of a block. How many. One look-up at a time for all of them: they do not
     wait for one another."""
@@ -84,7 +84,7 @@ def _gather(blocks, observable, member, block, voxels):  # type: ignore[no-untyp
     return count
 
 
-@kernel
+@kernel(allocates=False)
 def _add_candidates(patches, places, num_places, tolerance, count, found):  # type: ignore[no-untyped-def]
     """Append the patches of blocks whose plane comes within `tolerance` of the block that asks.
     places (N, 5): block, code of its first patch, and blocks away along x, y, z. Returns how many
@@ -146,7 +146,7 @@ def _near_candidates(blocks, patches, block, tolerance, found):  # type: ignore[
     return count
 
 
-@kernel
+@kernel(allocates=False)
 def _far_candidates(blocks, patches, block, tolerance, count, found):  # type: ignore[no-untyped-def]
     """Append the patches of the blocks two away: the other jamb of a door."""
     places, num = found.places, 0
@@ -163,7 +163,7 @@ def _far_candidates(blocks, patches, block, tolerance, count, found):  # type: i
     return _add_candidates(patches, places, num, tolerance, count, found)
 
 
-@kernel
+@kernel(allocates=False)
 def _place(local, seen):  # type: ignore[no-untyped-def]
     """A voxel's rounded centroid, eighths from the block corner."""
     return (
@@ -173,7 +173,7 @@ def _place(local, seen):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel
+@kernel(allocates=False)
 def _measure(columns, count, c):  # type: ignore[no-untyped-def]
     """How far a place is from the planes and boxes of the first `count` candidates."""
     x, y, z = float(c[0]), float(c[1]), float(c[2])
@@ -191,7 +191,7 @@ def _measure(columns, count, c):  # type: ignore[no-untyped-def]
         columns[WAY + 2, q] = (ahead if ahead > 0.0 else 0.0) + (behind if behind < 0.0 else 0.0)
 
 
-@kernel
+@kernel(allocates=False)
 def _dot(columns, q, o):  # type: ignore[no-untyped-def]
     return (
         columns[NX, q] * columns[NX, o]
@@ -200,19 +200,19 @@ def _dot(columns, q, o):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel
+@kernel(allocates=False)
 def _gap(columns, q):  # type: ignore[no-untyped-def]
     """Chebyshev distance of the voxel in turn from a candidate's box."""
     return max(abs(columns[WAY, q]), abs(columns[WAY + 1, q]), abs(columns[WAY + 2, q]))
 
 
-@kernel
+@kernel(allocates=False)
 def _cost(columns, q, gap, tolerance):  # type: ignore[no-untyped-def]
     off = columns[OFF, q] / tolerance
     return off**2 + (gap / (8.0 * LEFTOVER_REACH)) ** 2 + columns[WEIGHT, q]
 
 
-@kernel
+@kernel(allocates=False)
 def _join(columns, count, seen, tolerance):  # type: ignore[no-untyped-def]
     """Candidate that a leftover joins, -1: none. It must face the voxel's sensor, its plane must
     be near, and so must its box."""
@@ -234,7 +234,7 @@ def _join(columns, count, seen, tolerance):  # type: ignore[no-untyped-def]
     return best
 
 
-@kernel
+@kernel(allocates=False)
 def _bridged(columns, count, q, tolerance):  # type: ignore[no-untyped-def]
     """Whether the voxel in turn lies between candidate q and another of the same plane: on a
     threshold. (What is its own is none: the way to itself is no way back.)"""
@@ -252,7 +252,7 @@ def _bridged(columns, count, q, tolerance):  # type: ignore[no-untyped-def]
     return hits > 0
 
 
-@kernel
+@kernel(allocates=False)
 def _claim(found, near, count, tolerance, own):  # type: ignore[no-untyped-def]
     """Candidate of the first `near`, at an angle to `own`, that claims the voxel in turn as a
     corner, or as a threshold with the help of any of the `count`.
@@ -281,7 +281,7 @@ def _claim(found, near, count, tolerance, own):  # type: ignore[no-untyped-def]
     return best, alone
 
 
-@kernel
+@kernel(allocates=False)
 def _flat(columns, count):  # type: ignore[no-untyped-def]
     """Whether all candidates look the same way: then there is no corner."""
     for q in range(1, count):  # noqa: SIM110 numba has no all() of a generator
@@ -364,7 +364,7 @@ def _label_block(blocks, observable, patches, block, tolerance, scratch):  # typ
     return changed
 
 
-@kernel
+@kernel(allocates=False)
 def find_dependents(blocks, far, which, flags, out):  # type: ignore[no-untyped-def]
     """Blocks whose labels depend on the patches of the blocks `which`: these, those beside them,
     and those two away that are `far` (B,), with or without a block between. flags (B,) stay false.

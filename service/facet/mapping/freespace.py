@@ -20,7 +20,7 @@ FIRST_BLOCKS = 1024  # capacity to begin with
 assert 1 << SHIFT == CELL * TICKS
 
 
-@kernel
+@kernel(allocates=False)
 def _block(table, keys, num_blocks, key):  # type: ignore[no-untyped-def]
     """The block `key`, a new one where there is none; and the number of blocks."""
     block = np.int64(find(table[0], table[1], key))
@@ -32,7 +32,7 @@ def _block(table, keys, num_blocks, key):  # type: ignore[no-untyped-def]
     return block, num_blocks
 
 
-@kernel
+@kernel(allocates=False)
 def _pass(table, counts, keys, num_blocks, a, b, sign, ends):  # type: ignore[no-untyped-def]
     """Count a beam from a to b (ticks) in every cell it passes; the last one only if nothing is
     there (`ends` false). Amanatides & Woo 1987, in integers."""
@@ -75,7 +75,7 @@ def _pass(table, counts, keys, num_blocks, a, b, sign, ends):  # type: ignore[no
     return num_blocks
 
 
-@kernel
+@kernel(allocates=False)
 def _blocks_apart(a, b):  # type: ignore[no-untyped-def]
     """Blocks between two points (ticks), axis by axis."""
     shift = SHIFT + 3
@@ -85,7 +85,7 @@ def _blocks_apart(a, b):  # type: ignore[no-untyped-def]
     return total
 
 
-@kernel
+@kernel(allocates=False)
 def _pass_all(table, counts, keys, num_blocks, sensor, points, start, every, sign, ends):  # type: ignore[no-untyped-def]
     """Follow the chosen beams from `start` on. Returns (next beam, number of blocks)."""
     for p in range(start, points.shape[0]):
@@ -179,7 +179,7 @@ class FreeSpace:
         self._table = rehash(keys, self.num_blocks, 4 << (capacity - 1).bit_length())
 
 
-@kernel
+@kernel(allocates=False)
 def _cell_keys(block_keys, block, local, out):  # type: ignore[no-untyped-def]
     for c in range(block.shape[0]):
         i, j, k = unpack(block_keys[block[c]])

@@ -71,7 +71,7 @@ class Chain(NamedTuple):
     first: int  # number of the tile's first run
 
 
-@kernel
+@kernel(allocates=False)
 def _collect(blocks, patches, plane_of_patch, tile_key, block, members):  # type: ignore[no-untyped-def]
     """Voxels of a block whose patch, own or claiming, lies in the tile. How many."""
     rows, owner, claimed = members
@@ -200,7 +200,7 @@ def _chain(blocks, tile_key, before, first, last):  # type: ignore[no-untyped-de
     return Chain(head, link, np.zeros(last - first, np.bool_), first)
 
 
-@kernel
+@kernel(allocates=False)
 def _take_over(before, r, plane, chain, listed, run, counts):  # type: ignore[no-untyped-def]
     """List a run as what an old one is now, and count its voxels."""
     start, stay = before.start[r], 0
@@ -234,7 +234,7 @@ def _split(members, count, block, listed, num, end):  # type: ignore[no-untyped-
     return num, end
 
 
-@kernel
+@kernel(allocates=False)
 def _same_run(before, r, listed, run):  # type: ignore[no-untyped-def]
     """Whether an old run held just the members of a new one."""
     if before.size[r] != listed.size[run]:
@@ -248,7 +248,7 @@ def _same_run(before, r, listed, run):  # type: ignore[no-untyped-def]
     return True
 
 
-@kernel
+@kernel(allocates=False)
 def _recognise(before, place, chain, into, listed, begin, num, counts):  # type: ignore[no-untyped-def]
     """Find what runs of a block, listed from `begin` to `num`, were before."""
     for run in range(begin, num):
@@ -264,7 +264,7 @@ def _recognise(before, place, chain, into, listed, begin, num, counts):  # type:
             r = chain.link[r - chain.first]
 
 
-@kernel
+@kernel(allocates=False)
 def _inherit(before, place, chain, local, listed, begin, num, was, counts):  # type: ignore[no-untyped-def]
     """Count the voxels that went from runs of a block that are no more to new ones; was (VOXELS,)
     stays 0."""
@@ -371,7 +371,7 @@ def gather_members(  # type: ignore[no-untyped-def]
             _sort(listed, num, planes[n, 1], before, held, n)
 
 
-@kernel
+@kernel(allocates=False)
 def list_abroad(blocks, tile_key, rows, state, runs, ids, out):  # type: ignore[no-untyped-def]
     """Members of a tile's tile-planes that lie in other tiles, with the plane ids (T,) that they go
     by, as row << 32 | id. How many."""

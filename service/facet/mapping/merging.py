@@ -56,7 +56,7 @@ def limits(settings: MapSettings, sigma: float, angle_deg: float | None = None) 
     )
 
 
-@kernel
+@kernel(allocates=False)
 def plane_of(votes, scatter, unit):  # type: ignore[no-untyped-def]
     """(nx, ny, nz, variance along it, variance across it) of a node: the fit, or the mean normal of
     a small one. Across: the smaller of the two principal variances in the plane."""
@@ -75,7 +75,7 @@ def plane_of(votes, scatter, unit):  # type: ignore[no-untyped-def]
     return nx, ny, nz, max(0.0, spread) / votes, 0.0
 
 
-@kernel
+@kernel(allocates=False)
 def pool(va, ma, sa, vb, mb, sb, mean, scatter):  # type: ignore[no-untyped-def]
     """P1, P2: mean and scatter of the union, into the last two (Chan, Golub & LeVeque 1979)."""
     total = va + vb
@@ -92,7 +92,7 @@ def pool(va, ma, sa, vb, mb, sb, mean, scatter):  # type: ignore[no-untyped-def]
     return total
 
 
-@kernel
+@kernel(allocates=False)
 def _offset(normals, mean, a, b):  # type: ignore[no-untyped-def]
     """Signed distance of b's centroid from a's plane."""
     return (
@@ -102,7 +102,7 @@ def _offset(normals, mean, a, b):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel
+@kernel(allocates=False)
 def _dot(normals, a, b):  # type: ignore[no-untyped-def]
     return (
         normals[a, 0] * normals[b, 0]
@@ -111,14 +111,14 @@ def _dot(normals, a, b):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel
+@kernel(allocates=False)
 def _agreement(nx, ny, nz, unit):  # type: ignore[no-untyped-def]
     """Cosine between a normal and the mean of the members' normals."""
     length = np.sqrt(unit[0] * unit[0] + unit[1] * unit[1] + unit[2] * unit[2])
     return (nx * unit[0] + ny * unit[1] + nz * unit[2]) / length
 
 
-@kernel
+@kernel(allocates=False)
 def _best_cos(normals, narrow, unit, a, b):  # type: ignore[no-untyped-def]
     """Cosine between the normals of a and b. A narrow b may have that of its fit or the mean of its
     members', as the one turns with its noise, the other with what lies beside it."""
@@ -156,7 +156,7 @@ def _edge_costs(votes, mean, unit, normals, narrow, edges, limit):  # type: igno
     return costs
 
 
-@kernel
+@kernel(allocates=False)
 def _root(parent, t):  # type: ignore[no-untyped-def]
     while parent[t] != t:
         parent[t] = parent[parent[t]]

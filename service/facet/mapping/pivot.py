@@ -66,13 +66,13 @@ _ARCS = _arcs()
 _AROUND, _SPANS = _cells(_ARCS)
 
 
-@kernel
+@kernel(allocates=False)
 def _ahead(angle, start):  # type: ignore[no-untyped-def]
     """From one angle on to another, both in [0, 2 pi): how far it is, in [0, 2 pi)."""
     return angle - start if angle >= start else angle - start + _FULL
 
 
-@kernel
+@kernel(allocates=False)
 def _cut(gaps, ends, count, begin, end, length, q):  # type: ignore[no-untyped-def]
     """Take the open arc from `begin` to `end` out of the gaps (start, length); ends holds the
     points that bound each gap. Returns how many gaps are left."""
@@ -109,7 +109,7 @@ def _cut(gaps, ends, count, begin, end, length, q):  # type: ignore[no-untyped-d
     return count
 
 
-@kernel
+@kernel(allocates=False)
 def _surrounded(window, row, column):  # type: ignore[no-untyped-def]
     """Whether the eight cells round a cell all hold points. Then no point in it is on the boundary:
     whichever way the disc lies, it swallows one of these cells whole."""
@@ -179,7 +179,7 @@ def _roll(window, wanted, arcs, around, spans, edges):  # type: ignore[no-untype
     return num
 
 
-@kernel
+@kernel(allocates=False)
 def _apart(gaps, count, begin, length):  # type: ignore[no-untyped-def]
     """Whether an arc meets none of the gaps."""
     for g in range(count):
@@ -189,7 +189,7 @@ def _apart(gaps, count, begin, length):  # type: ignore[no-untyped-def]
     return True
 
 
-@kernel
+@kernel(allocates=False)
 def _exposed(window, row, column, pu, pv, arcs, around, spans, gaps, ends):  # type: ignore[no-untyped-def]
     """Find the gaps between the arcs of all points that the disc round (pu, pv) of a cell meets.
     How many there are."""

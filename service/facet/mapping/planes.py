@@ -176,7 +176,7 @@ def _average_sigma(nodes: Nodes) -> float:
     return float(np.average(sigmas, weights=nodes.votes))
 
 
-@kernel
+@kernel(allocates=False)
 def _fits(votes, mean, scatter, unit, t, normal, centre, limit):  # type: ignore[no-untyped-def]
     """RMS distance of a node's voxels to a plane, or -1 where it does not belong there."""
     u = unit[t]

@@ -131,7 +131,7 @@ def within_slab(votes, count, r, nx, ny, nz, own, half, sums):  # type: ignore[n
         towards = (
             fx * np.float32(view_x[i]) + fy * np.float32(view_y[i]) + fz * np.float32(view_z[i])
         )
-        inside = (distance[i] <= r) & (abs(off) <= farthest) & (towards > nothing)
+        inside = (distance[i] <= r) & (abs(off) < farthest) & (towards > nothing)
         one = unit if inside else zero
         number = np.int32(number + one)
         wi = np.int32(w[i] * one)

@@ -24,18 +24,18 @@ class Outline(NamedTuple):
     area: float  # (1/8 voxel)^2, holes taken out
 
 
-@kernel
+@kernel(allocates=False)
 def _vertex_key(u, v):  # type: ignore[no-untyped-def]
     return ((u + _SHIFT) << 32) | (v + _SHIFT)
 
 
-@kernel
+@kernel(allocates=False)
 def _half(x, y):  # type: ignore[no-untyped-def]
     """0 for angles in [0, 180), 1 for [180, 360)."""
     return 0 if y > 0 or (y == 0 and x > 0) else 1
 
 
-@kernel
+@kernel(allocates=False)
 def _before(ax, ay, bx, by, rx, ry):  # type: ignore[no-untyped-def]
     """Whether a comes before b, turning counter-clockwise from the direction r (r itself comes
     last)."""
@@ -157,7 +157,7 @@ def _split(chained, ends, keys):  # type: ignore[no-untyped-def]
     return edges[:num], stops[:rings]
 
 
-@kernel
+@kernel(allocates=False)
 def _turn(path, keys, edges, num):  # type: ignore[no-untyped-def]
     """Append a ring to edges, from its smallest vertex on. Returns the number of edges."""
     first = 0
@@ -196,7 +196,7 @@ def signed_area(ring: NDArray[np.int64] | NDArray[np.int32]) -> float:
     return float(_shoelace(ring)) / 2.0
 
 
-@kernel
+@kernel(allocates=False)
 def _shoelace(ring):  # type: ignore[no-untyped-def]
     """Twice the signed area of a ring (M, 2)."""
     total = np.int64(0)
@@ -206,7 +206,7 @@ def _shoelace(ring):  # type: ignore[no-untyped-def]
     return total
 
 
-@kernel
+@kernel(allocates=False)
 def inside(ring, u, v):  # type: ignore[no-untyped-def]
     """Whether the point lies inside the ring (even-odd)."""
     odd = False

@@ -41,7 +41,7 @@ class MapSettings:
     own_offset: float = 0.4  # of a voxel from the plane of its own region
     border: float = 0.35  # in-plane offset from its region's centroid, radii, at a border
     slab: float = 1.0
-    passes: int = 3
+    passes: int = 4
     thin_slab: float = 0.75  # of the last look where surfaces meet, if voxels hold points enough
     thin_passes: int = 8
     mixed_deg: float = 25.0  # thickness angle of a region in which surfaces meet

@@ -72,7 +72,7 @@ class Columns(NamedTuple):
     flags: NDArray[np.uint8]  # TOUCHED, DEEP
 
 
-@kernel
+@kernel(allocates=False)
 def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched_rows, before):  # type: ignore[no-untyped-def]
     """Add points from `start` on with `sign`; note the rows touched, and their sums before. Returns
     (next point, what is used now: blocks, ...); next < N means that a capacity ran out and the
@@ -202,13 +202,13 @@ def centroid(blocks, columns, row):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel
+@kernel(allocates=False)
 def _count_points(columns, rows, out):  # type: ignore[no-untyped-def]
     for q in range(rows.shape[0]):
         out[q] = count_points(columns, rows[q])
 
 
-@kernel
+@kernel(allocates=False)
 def _add_blocks(blocks, keys):  # type: ignore[no-untyped-def]
     """Add the blocks of keys (B,) to none. How many."""
     for b in range(keys.shape[0]):
@@ -216,7 +216,7 @@ def _add_blocks(blocks, keys):  # type: ignore[no-untyped-def]
     return keys.shape[0]
 
 
-@kernel
+@kernel(allocates=False)
 def _place(blocks, columns, rows):  # type: ignore[no-untyped-def]
     """Enter rows in their blocks. Returns how many lines are used."""
     num_lines = 1

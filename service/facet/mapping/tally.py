@@ -35,7 +35,7 @@ class Tally(NamedTuple):
     planes: NDArray[np.float64]  # (T, 4) unit normal and offset of what members are STRAY from
 
 
-@kernel
+@kernel(allocates=False)
 def _seen_from(nodes, t, tile_key, out):  # type: ignore[no-untyped-def]
     """Unit normal of a tile-plane, its offset from the corner of the tile and its width into out
     (5,), voxels. The width is 0 where it is too small to have one."""
@@ -100,7 +100,7 @@ def _settled(centroids, plane):  # type: ignore[no-untyped-def]
     return plane
 
 
-@kernel
+@kernel(allocates=False)
 def _corner(blocks, block, tile_key):  # type: ignore[no-untyped-def]
     """Where a block begins in a tile, voxels."""
     ti, tj, tk = unpack(tile_key)
@@ -108,7 +108,7 @@ def _corner(blocks, block, tile_key):  # type: ignore[no-untyped-def]
     return BLOCK * i - TILE * ti, BLOCK * j - TILE * tj, BLOCK * k - TILE * tk
 
 
-@kernel
+@kernel(allocates=False)
 def _drift(corner, old, new):  # type: ignore[no-untyped-def]
     """How far a plane (4,) moved in a block, voxels, at most."""
     dx, dy, dz = new[0] - old[0], new[1] - old[1], new[2] - old[2]
@@ -118,7 +118,7 @@ def _drift(corner, old, new):  # type: ignore[no-untyped-def]
     return abs(middle - (new[3] - old[3])) + reach
 
 
-@kernel
+@kernel(allocates=False)
 def _change(sources, row, corner, sign, pure, tally, t, sums):  # type: ignore[no-untyped-def]
     """Add a voxel's points, times the sign, to a tile-plane: to `pure` ones or to all."""
     columns = sources[1]
@@ -130,7 +130,7 @@ def _change(sources, row, corner, sign, pure, tally, t, sums):  # type: ignore[n
     _shift(columns, row, corner, sums, tally.points[t])
 
 
-@kernel
+@kernel(allocates=False)
 def _shift(columns, row, corner, sums, points):  # type: ignore[no-untyped-def]
     """Add a voxel's sums to points (10,) about the corner of the tile."""
     local = np.int64(columns.local[row])
@@ -138,7 +138,7 @@ def _shift(columns, row, corner, sums, points):  # type: ignore[no-untyped-def]
     shift_moments(sums, x, y, z, points)
 
 
-@kernel
+@kernel(allocates=False)
 def _look(sources, held, r, corner, plane, tally, t, sums, fresh):  # type: ignore[no-untyped-def]
     """Find what the members of a run are to their tile-plane, and change its PURE points by it:
     add them, where they are `fresh`. Sets the margin."""
@@ -166,7 +166,7 @@ def _look(sources, held, r, corner, plane, tally, t, sums, fresh):  # type: igno
     held.margin[r] = margin
 
 
-@kernel
+@kernel(allocates=False)
 def _count(sources, held, r, tally, t, sums):  # type: ignore[no-untyped-def]
     """Add the points of a run's members to the total."""
     for m in range(held.start[r], held.start[r] + held.size[r]):
@@ -174,14 +174,14 @@ def _count(sources, held, r, tally, t, sums):  # type: ignore[no-untyped-def]
             _change(sources, held.rows[m], (0, 0, 0), 1, False, tally, t, sums)
 
 
-@kernel
+@kernel(allocates=False)
 def _drop(sources, before, r, corner, tally, t, sums):  # type: ignore[no-untyped-def]
     """Take the points of a run that is no more out of its tile-plane."""
     for m in range(before.start[r], before.start[r] + before.size[r]):
         _leave(sources, before, m, corner, tally, t, sums)
 
 
-@kernel
+@kernel(allocates=False)
 def _leave(sources, before, m, corner, tally, t, sums):  # type: ignore[no-untyped-def]
     """Take the points of a member out of its tile-plane."""
     if before.state[m] == PURE:
@@ -212,13 +212,13 @@ def _merge(sources, before, old, held, r, corner, tally, t, sums):  # type: igno
         m += 1
 
 
-@kernel
+@kernel(allocates=False)
 def _key(local, held, m):  # type: ignore[no-untyped-def]
     """By which the members of a run are in order."""
     return 2 * np.int64(local[held.rows[m]]) + (held.state[m] == CLAIMED)
 
 
-@kernel
+@kernel(allocates=False)
 def _catch_up(sources, before, r, corner, news, tally, t, sums):  # type: ignore[no-untyped-def]
     """Add what came to the voxels of an old run. news: (place (V,) in what follows, plus 1, and
     (Q, SUMS) what the sums were)."""
@@ -318,7 +318,7 @@ def _finish(  # type: ignore[no-untyped-def]
     return same
 
 
-@kernel
+@kernel(allocates=False)
 def _rows_of(held, span):  # type: ignore[no-untyped-def]
     """Where the rows of runs that follow one another begin and end."""
     if span[0] == span[1]:

@@ -36,7 +36,7 @@ def tile_keys_of(block_keys):  # type: ignore[no-untyped-def]
     return out
 
 
-@kernel
+@kernel(allocates=False)
 def _tiles_near(block_keys, out):  # type: ignore[no-untyped-def]
     """Keys of tiles that hold one of the blocks (B,) or a 26-neighbour of one, again and again,
     into out (8 B,). How many."""

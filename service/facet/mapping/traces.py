@@ -262,7 +262,7 @@ def _counts(dx, dy, dz, word, key, seen, rule):  # type: ignore[no-untyped-def]
     z = 8 * dz + ((word >> 8) & 15) - ((seen >> 8) & 15)
     vx, vy, vz = ((word >> 16) & 31) - 8, ((word >> 21) & 31) - 8, ((word >> 26) & 31) - 8
     half = rule.slab if kind == SLAB else rule.thin_slab
-    return abs(ix * x + iy * y + iz * z) <= half and ix * vx + iy * vy + iz * vz > 0
+    return abs(ix * x + iy * y + iz * z) < half and ix * vx + iy * vy + iz * vz > 0
 
 
 @kernel(allocates=False)
