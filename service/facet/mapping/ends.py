@@ -105,9 +105,8 @@ def _begin(strip, c):  # type: ignore[no-untyped-def]
     if slope * strip.h[c] <= 0.0 or slope * slope > STEEPEST:
         return 0.0, 0.0
     half = strip.h[c] / slope
-    rest = half * half - strip.ss[c]
-    far = half + np.sqrt(max(0.0, rest))
-    if rest < 0.0 or far < NARROW * abs(slope):
+    far = half + np.sqrt(max(0.0, half * half - strip.ss[c]))
+    if far < NARROW * abs(slope):
         return 0.0, 0.0
     return strip.s[c] - far, far / slope
 
