@@ -22,7 +22,7 @@ from facet.mapping.kernel import kernel
 from facet.mapping.merging import Nodes
 from facet.mapping.normals import UNIT, NormalField
 from facet.mapping.patches import PatchField
-from facet.mapping.planes import Table
+from facet.mapping.planes import FREE, Table
 from facet.mapping.settings import STEPS, TILE, MapSettings
 from facet.mapping.store import VoxelStore, centroid
 from facet.mapping.tiles import TileField
@@ -232,6 +232,7 @@ class Bends:
             np.zeros(0, np.int64), np.zeros(1, np.int64), np.zeros((0, SUMS), np.int64)
         )
         self._stirred: set[int] = set()
+        self.bent = np.zeros(0, np.int64)  # (T,) bent strip of each tile-plane, FREE: none
 
     def forget(self, tiles: set[int]) -> None:
         """Members of these tiles, by their keys, or their normals, are not what they were."""
@@ -279,6 +280,10 @@ class Bends:
             angle, deviation = _arc(heights[plane], across.width)
             least = max(np.radians(ARC_DEG), ARC_SIGMAS * deviation)
             flat[plane] = angle * np.sign(across.angle) <= least
+        numbers = np.full(len(flat) + 1, FREE)  # FREE finds the last one
+        bent = np.flatnonzero(strips & ~flat)
+        numbers[bent] = np.arange(len(bent))
+        self.bent = numbers[label]
         for plane in np.flatnonzero(thin).tolist():
             flat[plane] = _bimodality(heights[plane]) < EMPTY
         return np.asarray(flat)

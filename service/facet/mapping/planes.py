@@ -276,15 +276,26 @@ def _pool_points(points, corners, label, core, num, mean, scatter):  # type: ign
         num[p] += points[t, 0]
 
 
+def pool_points(
+    table: Table, label: NDArray[np.int64], core: NDArray[np.bool_], count: int
+) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
+    """Pool the exact point moments of the tile-planes of `count` things, in canonical order.
+
+    label: (T,) which thing, FREE: none; core: (T,) whether it counts. Returns number (K,), mean
+    (K, 3) and scatter (K, 6) about it, voxels."""
+    num = np.zeros(count, np.int64)
+    mean, scatter = np.zeros((count, 3)), np.zeros((count, 6))
+    corners = (unpack_all(table.tile_keys) * float(TILE))[table.tile_of]
+    _pool_points(table.points, corners, label, core, num, mean, scatter)
+    return num, mean, scatter
+
+
 def fit_points(table: Table, planes: PlaneSet, voxel_m: float) -> PointFit:
     """Pool the exact point moments of each plane's core tile-planes, in canonical order.
 
     A plane with hardly any pure points is fitted to its voxels' centroids instead."""
     count = len(planes.nodes.votes)
-    num = np.zeros(count, np.int64)
-    mean, scatter = np.zeros((count, 3)), np.zeros((count, 6))
-    corners = (unpack_all(table.tile_keys) * float(TILE))[table.tile_of]
-    _pool_points(table.points, corners, planes.label, planes.core, num, mean, scatter)
+    num, mean, scatter = pool_points(table, planes.label, planes.core, count)
     few = num < ENOUGH_POINTS
     mean[few], scatter[few] = planes.nodes.mean[few], planes.nodes.scatter[few]
     on = planes.label != FREE
