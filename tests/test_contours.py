@@ -44,7 +44,7 @@ def test_incremental_outlines_equal_fresh_ones(name: str) -> None:
     assert normals
     fresh = ContourField(whole.settings)
     tiles = mapper._tiles.tiles
-    assert fresh.update(mapper._store, tiles, set(tiles), normals) == set(normals)
+    assert fresh.update(mapper._store, tiles, set(tiles), normals, {}) == set(normals)
     for plane_id, one in kept.items():
         two = fresh.contours[plane_id]
         assert two.shares.keys() == one.shares.keys()

@@ -8,11 +8,14 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from facet.mapping import contours
+from facet.mapping.contours import FRAME_UNIT, ContourField
 from facet.mapping.ends import CUT, Ends, find_ends
 from facet.mapping.mapper import Mapper
 from facet.mapping.normals import UNIT
 from facet.mapping.planes import fit_points
-from facet.mapping.settings import STEPS
+from facet.mapping.settings import STEPS, MapSettings
+from facet.warmup import warm_up
 from facet_protocol.messages import Scan
 from mapping_logs import cloud, mapped
 
@@ -133,3 +136,83 @@ def test_ends_do_not_depend_on_order_or_batches() -> None:
     assert len(once.nodes)
     np.testing.assert_array_equal(once.nodes, turned.nodes)
     np.testing.assert_array_equal(once.cuts, turned.cuts)
+
+
+def outlines(mapper: Mapper) -> list[Points]:
+    """(M, 3) outer rings in the scene, largest first."""
+    surfaces = [(p, s) for p in mapper.snapshot().changed for s in p.surfaces]
+    surfaces.sort(key=lambda own: -own[1].area_m2)
+    return [back(p.lift(s.outer)) for p, s in surfaces]
+
+
+def walls_end_with_the_arc(mapper: Mapper, radius: float) -> None:
+    """The outlines of both walls end within a voxel of it, and on the arc is nothing else."""
+    one, two = outlines(mapper)
+    if np.ptp(one[:, 1]) > np.ptp(two[:, 1]):
+        one, two = two, one
+    assert abs(one[:, 0].max()) < VOXEL_M
+    assert abs(two[:, 1].max() + radius) < VOXEL_M
+    assert abs(np.ptp(one[:, 0]) - LENGTH) < 2 * VOXEL_M
+    assert abs(np.ptp(two[:, 1]) - LENGTH) < 2 * VOXEL_M
+
+
+@pytest.mark.parametrize("seen_from", FROM)
+def test_outlines_end_with_their_planes(seen_from: str) -> None:
+    """And a part of the arc so flat that it passed for a plane has none."""
+    points = round_corner(np.random.default_rng(4), 1.5)
+    walls_end_with_the_arc(mapped(scans_of(points, FROM[seen_from])), 1.5)
+
+
+def test_walls_run_on_where_nobody_ends_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(Ends, "by_tile", lambda self, table: {})
+    points = round_corner(np.random.default_rng(4), 1.5)
+    with pytest.raises((AssertionError, ValueError)):
+        walls_end_with_the_arc(mapped(scans_of(points, FROM["within"])), 1.5)
+
+
+def test_outlines_follow_an_arc_that_comes_and_goes() -> None:
+    points = round_corner(np.random.default_rng(4), 1.5)
+    rest = (points[:, 0] > 1.5 * np.sin(np.radians(45.0))) & (points[:, 1] < -0.44)
+    (before,) = scans_of(points[~rest], FROM["within"])
+    (last,) = scans_of(points[rest], FROM["within"])
+    mapper = mapped([before])
+    (first, *_) = outlines(mapper)
+    assert not len(ends_of(mapper).nodes)
+    mapper.insert(last)
+    mapper.update()
+    walls_end_with_the_arc(mapper, 1.5)
+    assert mapper.digest() == mapped([last, before]).digest()
+    mapper.retract(last)
+    mapper.update()
+    np.testing.assert_array_equal(outlines(mapper)[0], first)
+    mapper.check_invariants()
+
+
+def test_outlines_change_where_only_ends_do() -> None:
+    """As when the rest of an arc is seen, tiles away."""
+    mapper = mapped(scans_of(round_corner(np.random.default_rng(4), 1.5), FROM["within"]))
+    field, tiles = mapper._contours, mapper._tiles.tiles
+    normals = {i: np.array(c.rounded) / FRAME_UNIT for i, c in field.contours.items()}
+    cuts, ended = ends_of(mapper).by_tile(mapper._table), rings_of(field)
+    assert field.update(mapper._store, tiles, set(), normals, cuts) == set()
+    assert field.update(mapper._store, tiles, set(), normals, {}) >= {1, 2}
+    assert rings_of(field) != ended
+    assert field.update(mapper._store, tiles, set(), normals, cuts) >= {1, 2}
+    assert rings_of(field) == ended
+
+
+def rings_of(field: ContourField) -> dict[int, list[bytes]]:
+    """Outer rings by plane id."""
+    return {i: [o.outer.tobytes() for o in c.outlines] for i, c in field.contours.items()}
+
+
+def test_a_service_that_is_warm_has_met_an_arc(monkeypatch: pytest.MonkeyPatch) -> None:
+    calls, before_end = [], contours.before_end
+
+    def counted(*given: object) -> NDArray[np.int32]:
+        calls.append(given)
+        return np.asarray(before_end(*given))
+
+    monkeypatch.setattr(contours, "before_end", counted)
+    warm_up(MapSettings())
+    assert calls

@@ -131,7 +131,12 @@ def test_a_frame_that_stays_as_it_began_is_noticed(monkeypatch: Patch) -> None:
     whole = field.update
 
     def update(
-        self: contours.ContourField, store: object, tiles: object, changed: object, normals: object
+        self: contours.ContourField,
+        store: object,
+        tiles: object,
+        changed: object,
+        normals: object,
+        cuts: object,
     ) -> object:
         still = {
             i: np.array(self.contours[i].rounded, float) / contours.FRAME_UNIT
@@ -139,7 +144,7 @@ def test_a_frame_that_stays_as_it_began_is_noticed(monkeypatch: Patch) -> None:
             else normal
             for i, normal in normals.items()  # type: ignore[attr-defined]
         }
-        return whole(self, store, tiles, changed, still)  # type: ignore[arg-type]
+        return whole(self, store, tiles, changed, still, cuts)  # type: ignore[arg-type]
 
     monkeypatch.setattr(field, "update", update)
     broken(orders)

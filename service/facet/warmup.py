@@ -31,6 +31,7 @@ def warm_up(settings: MapSettings) -> None:
     for along[0] in range(0, FLOOR, 4 * HALF):
         mapper.insert(_scan(ScanKind.CLOUD, 1, _floor() * voxel_m, along * voxel_m))
     mapper.insert(_scan(ScanKind.CLOUD, 1, _field() * voxel_m))
+    mapper.insert(_scan(ScanKind.CLOUD, 1, _bend() * voxel_m))
     mapper.update()
     little = _scan(ScanKind.CLOUD, 1, _rims() * voxel_m)
     for _ in range(SEEN):
@@ -72,6 +73,15 @@ def _rims() -> NDArray[np.float64]:
     a, b = _grid(8 * BLOCK, 2 * BLOCK)
     is_there = (abs(b) > 0.75 * BLOCK) | (abs(a) < BLOCK / 2)
     return np.stack((a, b, np.zeros_like(a)), axis=1)[is_there]
+
+
+def _bend() -> NDArray[np.float64]:
+    """(N, 3) voxels: two walls, under the floor, and a quarter of a circle between them."""
+    a, b = _grid(2 * HALF, 2 * HALF)
+    angle, radius, low = (a / HALF + 1.0) * np.pi / 4, HALF * 4 / 3, b - 3 * HALF
+    arc = np.stack((radius * np.sin(angle), radius * np.cos(angle), low), axis=1)
+    wall = np.stack((a - HALF, np.full_like(a, radius), low), axis=1)
+    return np.concatenate([arc, wall, wall[:, [1, 0, 2]]])
 
 
 def _field() -> NDArray[np.float64]:

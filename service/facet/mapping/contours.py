@@ -20,6 +20,7 @@ from facet.mapping.cells import (
     replace_edges,
     share_all,
 )
+from facet.mapping.ends import before_end
 from facet.mapping.pivot import CELLS, SIDE, boundary_edges
 from facet.mapping.rings import Outline, surfaces_of
 from facet.mapping.runs import deal, starts_of
@@ -34,6 +35,9 @@ Place = int  # of a (u, v) tile
 Member = tuple[int, int]  # tile key, stamp of a tile-plane there
 Drawn = tuple[int, Place]  # plane id, (u, v) tile
 Wanted = tuple[int, int, int, int]  # plane id, tile key, stamp, tile-plane
+Cuts = dict[tuple[int, int], tuple[tuple[int, ...], ...]]  # of a tile-plane: see `ends`
+Members = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]  # of a tile-plane: rows,
+# blocks of its runs, and voxels in each
 
 
 def round_normal(normal: NDArray[np.float64]) -> UnitNormal:
@@ -74,6 +78,7 @@ class ContourField:
         self.contours: dict[int, Contour] = {}
         self.rolled = 0  # (u, v) tiles rolled over in the last update
         self._owners: dict[int, set[tuple[int, int]]] = {}  # by tile key: plane id, stamp
+        self._cuts: Cuts = {}  # by tile key and stamp
 
     def update(
         self,
@@ -81,15 +86,19 @@ class ContourField:
         tiles: dict[int, Tile],
         changed: set[int],
         normals: dict[int, NDArray[np.float64]],
+        cuts: Cuts,
     ) -> set[int]:
         """Bring the outlines up to date with the planes, whose inside normals these are, by id.
-        `changed` are the tiles whose voxels, or plane ids, changed.
+        `changed` are the tiles whose voxels, or plane ids, changed; `cuts` say where planes end, by
+        tile key and tile-plane.
 
         Returns ids of the planes whose outlines changed."""
         for gone in self.contours.keys() - normals.keys():
             del self.contours[gone]
-        wanted = self._reframe(normals, changed, tiles)
         stale: defaultdict[int, set[Place]] = defaultdict(set)
+        cut = {(key, int(tiles[key].stamps[t])): own for (key, t), own in cuts.items()}
+        changed = changed | self._end(cut, stale)
+        wanted = self._reframe(normals, changed, tiles)
         for key in sorted(changed):
             tile = tiles[key]
             ids = tile.ids.tolist() if tile.num_planes else []
@@ -112,6 +121,18 @@ class ContourField:
             stale[plane_id].update(share.places)
         return self._redraw(stale)
 
+    def _end(self, cuts: Cuts, stale: dict[int, set[Place]]) -> set[int]:
+        """Drop the shares of tile-planes that end elsewhere than they did. Returns their tiles."""
+        different = {member for member, _ in self._cuts.items() ^ cuts.items()}
+        self._cuts = cuts
+        for key, stamp in different:
+            for plane_id, own in self._owners.get(key, set()):
+                contour = self.contours.get(plane_id) if own == stamp else None
+                share = contour.shares.pop((key, stamp), None) if contour else None
+                if share is not None:
+                    stale[plane_id].update(share.places)
+        return {key for key, _ in different}
+
     def _reframe(
         self, normals: dict[int, NDArray[np.float64]], changed: set[int], tiles: dict[int, Tile]
     ) -> list[Wanted]:
@@ -133,17 +154,9 @@ class ContourField:
         self, store: VoxelStore, tiles: dict[int, Tile], wanted: list[Wanted]
     ) -> list[Share]:
         """What tile-planes give to the outlines of their planes."""
-        keys = dict.fromkeys(key for _, key, _, _ in wanted)
-        row_ends = {key: tiles[key].starts.tolist() for key in keys}
-        run_ends = {key: tiles[key].run_starts.tolist() for key in keys}
-        by_row = [(key, slice(row_ends[key][t], row_ends[key][t + 1])) for _, key, _, t in wanted]
-        by_run = [(key, slice(run_ends[key][t], run_ends[key][t + 1])) for _, key, _, t in wanted]
-        rows = np.concatenate([_NO_ROWS, *(tiles[key].rows[own] for key, own in by_row)])
-        block = np.concatenate([_NO_ROWS, *(tiles[key].runs.block[own] for key, own in by_run)])
-        size = np.concatenate([_NO_ROWS, *(tiles[key].runs.size[own] for key, own in by_run)])
-        starts, run_starts = (
-            starts_of([own.stop - own.start for _, own in each]) for each in (by_row, by_run)
-        )
+        own = self._members(store, tiles, wanted)
+        rows, block, size = (np.concatenate([_NO_ROWS, *part]) for part in zip(*own, strict=True))
+        starts, run_starts = (starts_of([len(each[n]) for each in own]) for n in (0, 1))
         frames = [self.contours[plane_id].frame for plane_id, *_ in wanted]
         axes = np.array([(f.axis_u, f.axis_v) for f in frames], float).reshape(-1, 2, 3)
         points = np.empty((len(rows), 2), np.int16)
@@ -160,6 +173,25 @@ class ContourField:
                 corners.tolist(), ends, ends[1:], places, counts.tolist(), strict=False
             )
         ]
+
+    def _members(
+        self, store: VoxelStore, tiles: dict[int, Tile], wanted: list[Wanted]
+    ) -> list[Members]:
+        """Voxel rows of tile-planes, but for those beyond where their plane ends."""
+        keys = dict.fromkeys(key for _, key, _, _ in wanted)
+        row_ends = {key: tiles[key].starts.tolist() for key in keys}
+        run_ends = {key: tiles[key].run_starts.tolist() for key in keys}
+        members = []
+        for _, key, stamp, t in wanted:
+            rows = tiles[key].rows[row_ends[key][t] : row_ends[key][t + 1]]
+            own = slice(run_ends[key][t], run_ends[key][t + 1])
+            block, size = tiles[key].runs.block[own], tiles[key].runs.size[own]
+            cuts = self._cuts.get((key, stamp))
+            if cuts is not None:
+                rows = before_end(rows, store.blocks, store.columns, np.array(cuts, np.int64))
+                block, size = store.columns.block[rows], np.ones_like(rows)
+            members.append((rows, block, size))
+        return members
 
     def _redraw(self, stale: dict[int, set[Place]]) -> set[int]:
         """Draw the (u, v) tiles of planes again. Returns the planes whose outlines changed."""

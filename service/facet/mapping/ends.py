@@ -61,7 +61,7 @@ class Strip(NamedTuple):
     hh: NDArray[np.float64]
 
 
-@kernel
+@kernel(allocates=False)
 def _quadratic(m, a, b):  # type: ignore[no-untyped-def]
     """a . M b of a symmetric matrix (xx, xy, xz, yy, yz, zz)."""
     return (
@@ -71,7 +71,7 @@ def _quadratic(m, a, b):  # type: ignore[no-untyped-def]
     )
 
 
-@kernel
+@kernel(allocates=False)
 def _dot(a, b):  # type: ignore[no-untyped-def]
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
@@ -111,7 +111,7 @@ def _begin(strip, c):  # type: ignore[no-untyped-def]
     return strip.s[c] - far, far / slope
 
 
-@kernel
+@kernel(allocates=False)
 def _arc(strip, start, height):  # type: ignore[no-untyped-def]
     """(s, height, rms) of the centre of the circle that touches the plane and fits all strips best,
     by Gauss and Newton, and how far their points are off; rms is inf where it does not settle.

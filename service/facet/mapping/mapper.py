@@ -14,6 +14,7 @@ from facet.mapping.census import Census, tile_points
 from facet.mapping.contours import ContourField
 from facet.mapping.describe import Describer, Figures, Told
 from facet.mapping.digest import Digest, derived_digest, model_planes, state_digest
+from facet.mapping.ends import Ends, find_ends
 from facet.mapping.fitting import fit_planes
 from facet.mapping.freespace import FreeSpace
 from facet.mapping.identity import Heritage, Identity
@@ -50,6 +51,7 @@ class Grouped(NamedTuple):
     grown: list[int]  # tiles: tile-planes grown again
     changed: list[int]  # tiles: their voxels changed
     points: PointFit
+    ends: Ends
 
 
 class Mapper:
@@ -171,8 +173,9 @@ class Mapper:
         self._table = tabulate(self._tiles.tiles)
         self._planes = group_planes(self._table, limit, self.settings, self._bends.flat)
         points = fit_points(self._table, self._planes, self.settings.voxel_m)
+        ends = find_ends(self._table, self._planes, self._bends.bent, points, self.settings)
         done("planes")
-        return Grouped(regrouped, relabelled, grown, changed, points)
+        return Grouped(regrouped, relabelled, grown, changed, points, ends)
 
     def outline(
         self, ids: NDArray[np.int64], grouped: Grouped, done: Timer = lambda stage: None
@@ -183,7 +186,7 @@ class Mapper:
         done("identity")
         self._contours.update(
             self._store, self._tiles.tiles, changed,
-            {i: own.fit.inside for i, own in figures.items()},
+            {i: own.fit.inside for i, own in figures.items()}, grouped.ends.by_tile(self._table),
         )  # fmt: skip
         done("contours")
         updated = self._describer.update(figures, self._contours.contours, self._free)
