@@ -23,7 +23,7 @@ from typer.testing import CliRunner
 
 from facet import __version__
 from facet.__main__ import _said, app
-from facet.commands.demo import _is_alive
+from facet.commands.demo import MARK, _is_alive, _make_room
 from facet.commands.imports import _nanoseconds, _read_npz, _read_poses
 from facet.commands.replay import replay_log
 from facet.commands.settings import load_loops
@@ -43,6 +43,7 @@ COMMANDS = (
     *("export", "info", "digest", "recover", "config", "demo", "import"),
 )
 RECORDINGS = Path(__file__).parents[1] / "recordings"
+BUNDLED = RECORDINGS / "office-pushbroom.mcap"
 DATA = Path(__file__).parents[2] / "shared" / "data"
 
 
@@ -51,6 +52,13 @@ def facet(*arguments: object, code: int = 0) -> str:
     result = CliRunner().invoke(app, [str(a) for a in arguments])
     assert result.exit_code == code, result.output + repr(result.exception)
     return result.output
+
+
+def refused(*arguments: object) -> str:
+    """Why a command run in this process does not take what it was given."""
+    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    assert isinstance(result.exception, InputError), result.output + repr(result.exception)
+    return str(result.exception)
 
 
 def process(*arguments: object) -> subprocess.CompletedProcess[str]:
@@ -258,6 +266,9 @@ def test_import_npz(tmp_path: Path) -> None:
         ({"T_world_sensor": np.diag([-1.0, 1, 1, 1])[None].repeat(2, 0)}, "is no rotation"),
         ({"lengths": np.array([10, 21])}, r"sum to 31, points \(30, 3\)"),
         ({"points": np.zeros((30, 2))}, r"points \(30, 2\)"),
+        ({"lengths": np.array([10.0, 20.0])}, "lengths whole ones"),
+        ({"stamp_ns": np.array(["5", "9"])}, "stamp_ns and T_world_sensor need numbers"),
+        ({"stamp_ns": np.array([5, -9])}, "stamp_ns -9 lies before 1970"),
         ({"stamp_ns": None}, "stamp_ns .* needed are stamp_ns, T_world_sensor, points, lengths"),
     ],
 )
@@ -275,9 +286,33 @@ def test_an_npz_that_does_not_fit_is_named(
         _read_npz(tmp_path / "a.npz")
 
 
+@pytest.mark.parametrize("name", ["a.npz", "a.ply"])
+def test_what_is_not_what_its_name_says(tmp_path: Path, name: str) -> None:
+    (tmp_path / name).write_bytes(b"\xa3\x80\xff" * 100)
+    text = refused("import", tmp_path / name, tmp_path / "a.mcap")
+    assert name in text
+    assert re.search(r"not an? \.(npz|ply) file", text)
+    np.savez(tmp_path / "whole.npz", a=np.zeros(1000))
+    whole = (tmp_path / "whole.npz").read_bytes()
+    (tmp_path / "cut.npz").write_bytes(whole[: len(whole) // 2])
+    assert "not an .npz file" in refused("import", tmp_path / "cut.npz", tmp_path / "a.mcap")
+
+
+def test_a_log_without_a_scan_is_no_empty_map_in_silence(tmp_path: Path) -> None:
+    write_recording(tmp_path / "a.mcap", [replace(room(1)[0], schema="foxglove.Log")], {})
+    assert "no scan in it; `facet info` lists" in facet("replay", tmp_path / "a.mcap")
+    for command in (("digest",), ("export",), ("demo", "--recording")):
+        more = [tmp_path / "out.glb"] if command == ("export",) else []
+        more += ["--out", tmp_path / "demo"] if command[0] == "demo" else []
+        text = refused(*command, tmp_path / "a.mcap", *more)
+        assert "a.mcap: no scan in it" in text
+
+
 @pytest.mark.parametrize(
     ("line", "said"),
     [
+        ("one 0 0 1 0 0 0 1", "'one' are no seconds since 1970; a line is stamp"),
+        ("-1.5 0 0 1 0 0 0 1", "'-1.5' are no seconds since 1970"),
         ("1 0 0 1 0 0 0 1 9", "9 numbers, 8 are stamp x y z qx qy qz qw"),
         ("1 0 0 one 0 0 0 1", "'one'; a line is stamp x y z qx qy qz qw"),
         ("1 0 0 1 0 0 0 0", "has not the length 1"),
@@ -351,6 +386,17 @@ def test_stamps_are_exact() -> None:
         (("replay", __file__), 65, "not an MCAP file"),
         (("replay", __file__, "--voxel", "9"), 78, "mapping.voxel_m = 9.0"),
         (("replay", __file__, "--update-every", "never"), 2, "never"),
+        (("replay", __file__, "--out", __file__), 65, f"{__file__} is a file: name a folder"),
+        (("replay", __file__, "--updates", "."), 65, ". is a folder: name a file"),
+        (("replay", "."), 65, "facet: .: no .mcap file in this folder"),
+        (("export", __file__, "/dev/null", "--format", "ply"), 65, "/dev/null is no file"),
+        (("export", __file__, "a.xyz"), 2, "'xyz' is not one of json"),
+        (("demo", "--speed", "fast"), 2, "'fast' is neither a number above 0 nor max"),
+        (("import", __file__, "a.mcap"), 65, "its name ends in none of .npz, .ply, .pcd"),
+        (("import", str(BUNDLED), "a.mcap"), 65, "is a recording already: `facet replay`"),
+        (("simulate", "."), 65, ". is a folder: name a file"),
+        (("simulate", "x.mcap", "--duration", "inf"), 2, "--duration"),
+        (("simulate", "x.mcap", "--range-noise", "inf"), 2, "--range-noise"),
         (("run", "--listen", "tcp/0.0.0.0:7447"), 78, "open to the network"),
         (("run", "--viewer", "vr"), 78, "viewer"),
         (("run", "--listen", "127.0.0.1:7447"), 78, "PROTOCOL/HOST:PORT"),
@@ -496,6 +542,27 @@ def test_a_viewer_that_dies_changes_nothing(log: Path, tmp_path: Path) -> None:
     assert code == 0, output
     assert "recorded 6 of 6" in output
     assert "viewer_ended" in output
+
+
+def test_the_demo_empties_no_folder_but_its_own(log: Path, tmp_path: Path) -> None:
+    """`facet demo --out out` would have taken the map in out/log with it."""
+    for folder, name in (("home", "thesis.txt"), ("out", "log"), ("mixed", "notes.md")):
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / name).write_text("dear")
+        if folder == "mixed":
+            (tmp_path / folder / MARK).write_text("")
+        with pytest.raises(InputError, match=rf"holds '{name}', not from a demo"):
+            _make_room(tmp_path / folder, log)
+        assert (tmp_path / folder / name).read_text() == "dear"
+    with pytest.raises(InputError, match="is a file: name a folder"):
+        _make_room(log, log)
+    again = tmp_path / "demo"
+    (again / "log").mkdir(parents=True)
+    (again / MARK).write_text("ready")
+    with pytest.raises(InputError, match="which is emptied"):
+        _make_room(again, again / "log" / "a.mcap")
+    _make_room(again, log)
+    assert list(again.iterdir()) == []
 
 
 def test_the_demo_ends_with_the_same_map_twice(log: Path, tmp_path: Path) -> None:

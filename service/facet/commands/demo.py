@@ -15,9 +15,20 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from facet.commands.replay import Replayed, replay_log, summary, write_outputs
+from facet.commands.play import parse_speed
+from facet.commands.replay import NO_SCAN_CURE, Replayed, replay_log, summary, write_outputs
 from facet.commands.talk import statuses
-from facet.commands.terminal import Exit, InputError, err, existing, megabytes, out, progress, table
+from facet.commands.terminal import (
+    Exit,
+    InputError,
+    err,
+    existing,
+    megabytes,
+    out,
+    out_folder,
+    progress,
+    table,
+)
 from facet.config import Config
 from facet.session import client_settings, open_session
 from facet.sources.naming import is_scan
@@ -31,6 +42,8 @@ if TYPE_CHECKING:
 
 RECORDINGS = Path(__file__).parents[3] / "recordings"
 MAP = "demo"
+MARK = "service.txt"  # what the service says: written first
+WRITTEN = {MARK, "log", "model.json", "picture.png", "demo.rrd"}
 READY_S = 900.0  # the first start compiles: minutes, on a busy machine
 QUIET_S = 20.0  # nothing new is applied for so long: something is stuck
 ENDING_S = 15.0
@@ -56,16 +69,34 @@ def demo(
     """
     source = recording or _bundled()
     existing([source])
+    parse_speed(speed)
     scans = [envelope for envelope in Recording([source]) if is_scan(envelope)]
     num_bytes = sum(len(envelope.payload) for envelope in scans)
-    shutil.rmtree(out_dir, ignore_errors=True)
-    out_dir.mkdir(parents=True)
+    if not scans:
+        raise InputError(f"{source}: no scan in it; {NO_SCAN_CURE}")
+    _make_room(out_dir, source)
     out.print(f"{source.name}: {len(scans):,} scans, {megabytes(num_bytes)} of raw scans")
     wall_s = _map_live(source, len(scans), out_dir, speed)
     model, result = _map_again(out_dir)
     table("demo", ("what", "value"), _rows(model, wall_s, result, num_bytes, out_dir))
     _print_paths(out_dir)
     raise typer.Exit(_verdict(model, out_dir, result, len(scans)))
+
+
+def _make_room(folder: Path, source: Path) -> None:
+    """Empty the folder of a demo before, or make one. Raises InputError for any other: what it
+    holds would be gone."""
+    out_folder(folder)
+    names = {path.name for path in folder.iterdir()}
+    if names and (MARK not in names or names - WRITTEN):
+        other = min(names - WRITTEN or names)
+        raise InputError(
+            f"{folder} holds {other!r}, not from a demo: --out needs a folder of its own"
+        )
+    if source.resolve().is_relative_to(folder.resolve()):
+        raise InputError(f"{source} lies in {folder}, which is emptied: --out needs another folder")
+    shutil.rmtree(folder)
+    folder.mkdir()
 
 
 def _bundled() -> Path:
@@ -83,7 +114,7 @@ def _map_live(source: Path, num_scans: int, out_dir: Path, speed: str) -> float:
     endpoint = f"tcp/127.0.0.1:{_free_port()}"
     service = ["run", "--map", MAP, "--listen", endpoint, "--record", str(out_dir / "log")]
     robot = ["play", str(source), "--map", MAP, "--connect", endpoint, "--speed", speed]
-    log = out_dir / "service.txt"
+    log = out_dir / MARK
     with log.open("wb") as service_out, _child(service, service_out) as running:
         with _connected(endpoint, running, log) as session:
             started = time.monotonic()

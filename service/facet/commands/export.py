@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from facet.commands.terminal import Exit, existing, megabytes, out
+from facet.commands.terminal import Exit, existing, megabytes, out, out_file
 from facet.config import Config
 
 
@@ -15,7 +15,7 @@ def export(
     file: Annotated[
         Path, typer.Argument(metavar="MODEL|LOG", help="model.json, or a log (.mcap) to replay.")
     ],
-    out_file: Annotated[Path, typer.Argument(metavar="OUT", help="The file to write.")],
+    target: Annotated[Path, typer.Argument(metavar="OUT", help="The file to write.")],
     file_format: Annotated[
         str | None,
         typer.Option("--format", help="json | ply | glb | png.", show_default="OUT's ending"),
@@ -35,12 +35,13 @@ def export(
     from facet.export.formats import FORMATS
     from facet.export.model import read_model
 
-    name = file_format or out_file.suffix.removeprefix(".")
+    name = (file_format or target.suffix.removeprefix(".")).lower()
     if name not in FORMATS:
         raise typer.BadParameter(
             f"{name!r} is not one of {', '.join(FORMATS)}", param_hint="--format"
         )
     existing([file])
+    out_file(target)
     code = Exit.CLEAN
     if file.suffix == ".json":
         model, tiles = read_model(file), []
@@ -50,7 +51,7 @@ def export(
         result = replay_log([file], Config())
         require_scans(result)
         model, tiles, code = result.model(), result.mapper.points(), result.exit_code
-    out_file.parent.mkdir(parents=True, exist_ok=True)
-    FORMATS[name](model, tiles, out_file)
-    out.print(f"{out_file}: {len(model['planes'])} planes, {megabytes(out_file.stat().st_size)}")
+    target.parent.mkdir(parents=True, exist_ok=True)
+    FORMATS[name](model, tiles, target)
+    out.print(f"{target}: {len(model['planes'])} planes, {megabytes(target.stat().st_size)}")
     raise typer.Exit(code)

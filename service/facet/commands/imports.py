@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import zipfile
+import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,12 +15,14 @@ import typer
 from numpy.typing import NDArray
 
 from facet.commands.simulate import envelope_of
-from facet.commands.terminal import InputError, existing, megabytes, out, progress
+from facet.commands.terminal import InputError, existing, megabytes, out, out_file, progress
 from facet.sinks.log_file import write_recording
 from facet_protocol.messages import Envelope, Pose, Scan, ScanKind
 
 RIGID = 1e-3  # how far a rotation may be from one, in any element of R Rᵀ
+CLOUDS = (".ply", ".pcd")
 POSE_LINE = "stamp x y z qx qy qz qw"
+_SECONDS = re.compile(r"[0-9]{1,10}(\.[0-9]*)?")
 NONE = np.zeros((0, 3), dtype=np.float32)
 
 
@@ -34,7 +39,7 @@ def import_(
     source: Annotated[
         Path, typer.Argument(metavar="FILE|DIR", help=".npz, .ply or .pcd, or a folder of clouds.")
     ],
-    out_file: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The recording.")],
+    recording: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The recording.")],
     poses: Annotated[
         Path | None,
         typer.Option(help=f"Lines `{POSE_LINE}` (TUM: seconds, metres), one a cloud."),
@@ -54,6 +59,7 @@ def import_(
     T_world_sensor (S, 4, 4), points (N, 3) of all scans one after the other, lengths (S,).
     """
     existing([source] + ([poses] if poses else []))
+    out_file(recording)
     num_scans, clouds = _open(source, poses)
 
     def envelopes() -> Iterator[Envelope]:
@@ -63,8 +69,8 @@ def import_(
                 bar.update(bar.task_ids[0], completed=sequence)
 
     metadata = {"map": map_id, "frame": "map", "made_by": f"facet import {source.name}"}
-    num = write_recording(out_file, envelopes(), metadata)
-    out.print(f"{out_file}: {num:,} scans, {megabytes(out_file.stat().st_size)}")
+    num = write_recording(recording, envelopes(), metadata)
+    out.print(f"{recording}: {num:,} scans, {megabytes(recording.stat().st_size)}")
 
 
 def _scan(cloud: PosedCloud, robot: str, sensor: str, sequence: int) -> Scan:
@@ -86,6 +92,10 @@ def _open(source: Path, poses: Path | None) -> tuple[int, Iterator[PosedCloud]]:
     """(how many, the clouds). Raises InputError."""
     if source.suffix == ".npz":
         return _read_npz(source)
+    if source.suffix == ".mcap":
+        raise InputError(f"{source} is a recording already: `facet replay` reads it as it is")
+    if source.is_file() and source.suffix not in CLOUDS:
+        raise InputError(f"{source}: its name ends in none of .npz, {', '.join(CLOUDS)}")
     files = [source] if source.is_file() else _clouds_in(source)
     if poses is None and len(files) > 1:
         raise InputError(f"{source}: {len(files)} clouds need their poses: --poses FILE")
@@ -99,7 +109,7 @@ def _open(source: Path, poses: Path | None) -> tuple[int, Iterator[PosedCloud]]:
 
 
 def _clouds_in(folder: Path) -> list[Path]:
-    files = sorted(f for f in folder.iterdir() if f.suffix in (".ply", ".pcd"))
+    files = sorted(f for f in folder.iterdir() if f.suffix in CLOUDS)
     if not files:
         raise InputError(f"{folder}: no .ply or .pcd file in it")
     return files
@@ -108,15 +118,21 @@ def _clouds_in(folder: Path) -> list[Path]:
 def _read_npz(path: Path) -> tuple[int, Iterator[PosedCloud]]:
     """`stamp_ns` (S,), `T_world_sensor` (S, 4, 4), `points` (N, 3), `lengths` (S,)."""
     try:
-        with np.load(path, allow_pickle=False) as data:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as data:
             stamps, transforms = data["stamp_ns"], data["T_world_sensor"]
             points, lengths = data["points"].astype(np.float32, copy=False), data["lengths"]
     except KeyError as error:
         raise InputError(
             f"{path}: {error.args[0]}; needed are stamp_ns, T_world_sensor, points, lengths"
         ) from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"{path}: {error}") from error
+    except (OSError, TypeError, ValueError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+        is_npz = zipfile.is_zipfile(path)
+        raise InputError(f"{path}: {error if is_npz else 'not an .npz file'}") from error
+    kinds = [(stamps, "iuf"), (transforms, "iuf"), (lengths, "iu")]
+    if any(a.dtype.kind not in kind for a, kind in kinds) or not np.isfinite(stamps).all():
+        raise InputError(f"{path}: stamp_ns and T_world_sensor need numbers, lengths whole ones")
+    if (stamps < 0).any():
+        raise InputError(f"{path}: stamp_ns {int(stamps.min())} lies before 1970")
     num, told = stamps.size, int(lengths.sum())
     shapes = (stamps.shape, transforms.shape, lengths.shape, points.shape)
     if shapes != ((num,), (num, 4, 4), (num,), (told, 3)) or (lengths < 0).any():
@@ -173,6 +189,8 @@ def _read_poses(path: Path) -> list[tuple[int, Pose]]:
 
 def _nanoseconds(seconds: str) -> int:
     """Exactly: a float has no room for nanoseconds since 1970."""
+    if not _SECONDS.fullmatch(seconds):
+        raise ValueError(f"{seconds!r} are no seconds since 1970")
     whole, _, fraction = seconds.partition(".")
     return int(whole) * 10**9 + int((fraction + "0" * 9)[:9])
 
@@ -188,6 +206,8 @@ def _read_cloud(path: Path) -> NDArray[np.float32]:
         return np.stack([np.asarray(vertex[axis], np.float32) for axis in "xyz"], axis=1)
     except InputError:
         raise
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: not a {path.suffix} file") from error
     except Exception as error:
         raise InputError(f"{path}: {error}") from error
 

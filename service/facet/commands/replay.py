@@ -24,7 +24,17 @@ from facet.commands.settings import (
     recorded_settings,
     robots_overrides,
 )
-from facet.commands.terminal import Exit, InputError, err, existing, out, progress, table
+from facet.commands.terminal import (
+    Exit,
+    InputError,
+    err,
+    existing,
+    out,
+    out_file,
+    out_folder,
+    progress,
+    table,
+)
 from facet.config import Config, load_config
 from facet.cuts import logged_cuts, timed_cuts
 from facet.outgoing import Outgoing
@@ -42,6 +52,7 @@ if TYPE_CHECKING:
     from facet.mapping.mapper import Mapper
 
 POINTS_EVERY_NS = 500_000_000
+NO_SCAN_CURE = "`facet info` lists what is"
 MOST = 0.5  # of the points: a wrong unit leaves out about all
 
 
@@ -253,6 +264,11 @@ def replay(
     if update_every != "log":
         parse_every(update_every)
     rrd = _rrd_path(viewer, out_dir)
+    existing(logs)
+    if out_dir is not None:
+        out_folder(out_dir)
+    for file in filter(None, (rrd, updates)):
+        out_file(file)
     sinks = _sinks(rrd, updates)
     with progress("replaying", _num_scans(logs)) as bar:
         result = replay_log(
@@ -306,7 +322,6 @@ def write_outputs(model: Model, folder: Path) -> None:
     from facet.export.model import write_model
     from facet.export.picture import write_picture
 
-    folder.mkdir(parents=True, exist_ok=True)
     write_model(model, folder / "model.json")
     write_picture(model, folder / "picture.png")
 
@@ -319,6 +334,8 @@ def print_result(result: Replayed, model: Model) -> None:
     if result.num_left_out:
         reasons = ", ".join(f"{num:,} {name}" for name, num in result.left_out.items())
         err.print(f"left out: {reasons}")
+    if not result.num_scans:
+        err.print(f"no scan in it; {NO_SCAN_CURE}")
     rejected = {
         name.removeprefix("points_rejected."): num
         for name, num in result.account.counters().items()
@@ -379,4 +396,5 @@ def _num_scans(logs: list[Path]) -> int | None:
 def require_scans(result: Replayed) -> None:
     """Raises InputError for a log without a single scan."""
     if not result.account["applied"]:
-        raise InputError("no scan in it that could be mapped")
+        (first, *_) = result.recording.paths
+        raise InputError(f"{first}: no scan in it that could be mapped; {NO_SCAN_CURE}")

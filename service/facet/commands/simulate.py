@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from facet.commands.terminal import megabytes, out, progress
+from facet.commands.terminal import megabytes, out, out_file, progress
 from facet.sinks.log_file import write_recording
 from facet_protocol.codec import encode
 from facet_protocol.messages import Envelope, LineFan, Scan
@@ -18,32 +18,36 @@ LEAST = 0.001  # m/s, and scans a second: nothing moves at 0
 
 
 def simulate(
-    out_file: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The recording.")],
+    recording: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The recording.")],
     scene: Annotated[str, typer.Option(help="office | corridor | hall | hall85k")] = "office",
     sensor: Annotated[str, typer.Option(help="lidar3d | pushbroom | depth")] = "pushbroom",
     range_noise: Annotated[
-        float, typer.Option(min=0.0, help="m, standard deviation along a beam.")
+        float, typer.Option(min=0.0, max=10.0, help="m, standard deviation along a beam.")
     ] = 0.012,
     pose_noise: Annotated[
-        float, typer.Option(min=0.0, help="m, standard deviation of each axis of a position.")
+        float,
+        typer.Option(min=0.0, max=10.0, help="m, standard deviation of each axis of a position."),
     ] = 0.008,
     heading_noise: Annotated[
-        float, typer.Option(min=0.0, help="degrees, standard deviation of the heading.")
+        float,
+        typer.Option(min=0.0, max=180.0, help="degrees, standard deviation of the heading."),
     ] = 0.0,
     seed: Annotated[int, typer.Option(min=0, help="The same seed, the same recording.")] = 0,
     duration: Annotated[
-        float | None, typer.Option(min=0.0, help="s.", show_default="the whole drive")
+        float | None, typer.Option(min=0.0, max=1e6, help="s.", show_default="the whole drive")
     ] = None,
     max_points: Annotated[
         int | None, typer.Option(min=1, help="Spread so many points over the whole drive.")
     ] = None,
     speed: Annotated[
         float | None,
-        typer.Option(min=LEAST, help="m/s, how fast it drives.", show_default="the sensor's own"),
+        typer.Option(
+            min=LEAST, max=1e3, help="m/s, how fast it drives.", show_default="the sensor's own"
+        ),
     ] = None,
     rate: Annotated[
         float | None,
-        typer.Option(min=LEAST, help="Scans a second.", show_default="the sensor's own"),
+        typer.Option(min=LEAST, max=1e5, help="Scans a second.", show_default="the sensor's own"),
     ] = None,
     robot: Annotated[str, typer.Option(help="Name of the robot.")] = "sim",
     map_id: Annotated[str, typer.Option("--map", help="Name of the map.")] = "map",
@@ -59,6 +63,7 @@ def simulate(
     from facet.simulate import SCENES, SENSORS, Noise, Observer, Simulation
     from facet.sinks.log_file import COMPRESSIONS
 
+    out_file(recording)
     _check("scene", scene, SCENES)
     _check("sensor", sensor, SENSORS)
     _check("compression", compression, COMPRESSIONS)
@@ -88,10 +93,10 @@ def simulate(
         "frame": "map",
         "made_by": f"facet simulate --scene {scene} --sensor {sensor} --seed {seed}",
     }
-    num = write_recording(out_file, envelopes(), metadata, compression)
-    truth_file = out_file.with_suffix(".truth.json")
+    num = write_recording(recording, envelopes(), metadata, compression)
+    truth_file = recording.with_suffix(".truth.json")
     observer.truth().write(truth_file)
-    out.print(f"{out_file}: {num:,} scans, {megabytes(out_file.stat().st_size)}")
+    out.print(f"{recording}: {num:,} scans, {megabytes(recording.stat().st_size)}")
     out.print(f"{truth_file}: what is true of the scene")
 
 

@@ -98,5 +98,21 @@ def existing(paths: Iterable[Path]) -> list[Path]:
     return checked
 
 
+def out_folder(path: Path) -> Path:
+    """The same path, a folder that is there. Raises InputError where a file is in its place."""
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path} is a file: name a folder")
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def out_file(path: Path) -> Path:
+    """The same path, where a file may be written. Raises InputError where something else is: it is
+    said before the work, and no device is replaced."""
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path} is {'a folder' if path.is_dir() else 'no file'}: name a file")
+    return path
+
+
 def megabytes(num_bytes: int) -> str:
     return f"{num_bytes / 1e6:,.1f} MB" if num_bytes >= 1e5 else f"{num_bytes / 1e3:,.1f} kB"

@@ -9,10 +9,11 @@ MAX_NOTES = 100
 
 
 class LogError(ValueError):
-    """A log that cannot be read: which file, at which byte, and why."""
+    """A log that cannot be read: which file, at which byte if any, and why."""
 
-    def __init__(self, path: Path, offset: int, reason: str) -> None:
-        super().__init__(f"{path}: byte {offset}: {reason}")
+    def __init__(self, path: Path, offset: int | None, reason: str) -> None:
+        where = f"{path}: byte {offset}" if offset is not None else str(path)
+        super().__init__(f"{where}: {reason}")
         self.path, self.offset, self.reason = path, offset, reason
 
 

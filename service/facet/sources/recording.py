@@ -121,7 +121,7 @@ def _files(path: Path) -> list[Path]:
         return [path]
     files = sorted(path.glob("*.mcap"))
     if not files:
-        raise LogError(path, 0, "no .mcap file in this folder")
+        raise LogError(path, None, "no .mcap file in this folder")
     return files
 
 
