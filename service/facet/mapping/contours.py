@@ -36,7 +36,7 @@ Member = tuple[int, int]  # tile key, stamp of a tile-plane there
 Drawn = tuple[int, Place]  # plane id, (u, v) tile
 Wanted = tuple[int, int, int, int]  # plane id, tile key, stamp, tile-plane
 Cuts = dict[tuple[int, int], tuple[tuple[int, ...], ...]]  # of a tile-plane: see `ends`
-Members = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int32]]  # of a tile-plane: rows,
+Members = tuple[NDArray[np.int32], NDArray[np.int32], NDArray[np.int16]]  # of a tile-plane: rows,
 # blocks of its runs, and voxels in each
 
 
@@ -155,7 +155,7 @@ class ContourField:
     ) -> list[Share]:
         """What tile-planes give to the outlines of their planes."""
         own = self._members(store, tiles, wanted)
-        rows, block, size = (np.concatenate([_NO_ROWS, *part]) for part in zip(*own, strict=True))
+        rows, block, size = (np.concatenate([_NO_ROWS, *(one[n] for one in own)]) for n in range(3))
         starts, run_starts = (starts_of([len(each[n]) for each in own]) for n in (0, 1))
         frames = [self.contours[plane_id].frame for plane_id, *_ in wanted]
         axes = np.array([(f.axis_u, f.axis_v) for f in frames], float).reshape(-1, 2, 3)
@@ -189,7 +189,7 @@ class ContourField:
             cuts = self._cuts.get((key, stamp))
             if cuts is not None:
                 rows = before_end(rows, store.blocks, store.columns, np.array(cuts, np.int64))
-                block, size = store.columns.block[rows], np.ones_like(rows)
+                block, size = store.columns.block[rows], np.ones(len(rows), np.int16)
             members.append((rows, block, size))
         return members
 

@@ -39,7 +39,7 @@ def kernel(
     name for it; one that does make an array is then refused by the compiler.)"""
     if function is None:
         return lambda own: kernel(own, parallel=parallel, allocates=allocates)
-    options = {} if allocates else {"_nrt": False}
+    options: Any = {} if allocates else {"_nrt": False}
     config: Any = numba.config
     before = config.CACHE_DIR
     if _WRITABLE:
