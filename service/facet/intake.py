@@ -121,6 +121,7 @@ class Intake:
         self._derived: deque[Addressed | threading.Event] = deque()
         self._said: list[Addressed] = []  # written, not yet durable: for the follower
         self._took_s = 0.0  # the last commit
+        self._is_asked = False  # for scans, before they are due
         self._is_finished = False  # the log is whole, and nothing more comes
         self._awaited: list[threading.Event] = []  # set when what was taken is durable
         self._scans: list[Envelope] = []  # written, not yet durable
@@ -154,6 +155,14 @@ class Intake:
         """Commit what `write` has taken without waiting for the clock. Scans wait for it all the
         same: an update that brought the next ones at once would leave the mapper no rest."""
         self._inbox.call()
+
+    def catch_up(self, timeout_s: float) -> bool:
+        """Commit what has come in by now, scans too, and wait until it is handed on: for a mapper
+        whose updates take longer than `commit_s`, and who has no rest anyway. A scan then waits for
+        the update under way, and never for the next one."""
+        self._is_asked = True
+        self._inbox.call()
+        return self.is_logged(timeout_s)
 
     def is_logged(self, timeout_s: float) -> bool:
         """Whether all that `write` has taken by now is durable, or is after so long."""
@@ -194,6 +203,8 @@ class Intake:
         due = time.monotonic() + self._commit_s
         while not self._stopping.is_set():
             is_due = self._inbox.wait(max(0.0, due - time.monotonic()), BATCH_BYTES)
+            if self._is_asked:
+                self._is_asked, is_due = False, True
             if not is_due and self._took_s > HURRY_S:
                 continue
             if is_due and not self._account.failure and self._durable.wait_for_room(self._commit_s):
@@ -297,8 +308,6 @@ class Intake:
         self._hand_on()
 
     def _hand_on(self) -> None:
-        while self._awaited:
-            self._awaited.pop().set()
         said, self._said = self._said, []
         for envelope, message in said:
             if self.follower is not None:
@@ -311,6 +320,8 @@ class Intake:
             position = self._recorder.position
             self._note_past(scans, position)
             self._durable.put(scans, position)
+        while self._awaited:
+            self._awaited.pop().set()
 
     def _acknowledge(self, source: str) -> None:
         """All that was noted is in the log now, up to the newest number of its epoch, but for what

@@ -41,6 +41,7 @@ from facet.status import Account
 
 logger = logging.getLogger(__name__)
 
+CATCH_UP_S = 0.02  # after a long update: for the scans that came in meanwhile to become durable
 DRAIN_S = 1.0  # at the end: for what has come in to become durable
 LAST_UPDATE_S = 2.5  # at the end: no update starts later than this after `stop`
 JOIN_S = 5.0
@@ -237,9 +238,13 @@ class Service:
         if self._pipeline.is_stale and time.monotonic() <= self._stop_at:
             self.account.stages({"insert": (time.monotonic() - started) * 1e3})
             update = self._pipeline.update()
-            self._intake.hurry()
+            took_s = time.monotonic() - started
+            if took_s > self._config.record.commit_ms * 1e-3:
+                self._intake.catch_up(CATCH_UP_S)
+            else:
+                self._intake.hurry()
             self.account.gauge("planes_changed", len(update.changed))
-            self.account.gauge("update_ms", (time.monotonic() - started) * 1e3)
+            self.account.gauge("update_ms", took_s * 1e3)
             self.account.gauge("map_lag_s", (time.time_ns() - self._pipeline.log_time_ns) * 1e-9)
             self.account.gauge("voxels", self._mapper.counts().voxels)
         if self._position is not None and self._pipeline.is_settled and self._keeper.is_due():
