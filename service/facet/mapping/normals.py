@@ -89,7 +89,7 @@ def _estimate_block(  # type: ignore[no-untyped-def]
 
     dirty (8,): bits of its dirty voxels; num_changes: dirty voxels round it, -1: too many."""
     turned = False
-    state = scratch[5]
+    lists, votes, sums, state, changes = scratch
     for narrow, margin in ((True, NARROW), (False, WIDE), (False, rule.largest)):
         left = np.uint64(0)
         gather(blocks, observable, block, min(margin, rule.largest), halo)
@@ -102,17 +102,21 @@ def _estimate_block(  # type: ignore[no-untyped-def]
                 row = row_at(blocks, block, local)
                 seen = observable[row]
                 one_line = seen >> 32 != 0  # asks for more than sums
-                whole = recall(traces, share, row, scratch)
+                place = recall(traces, share, row, state)
+                kept = traces.keys[share, place], traces.sums[share, place]
+                own = lists, votes, sums, kept[0], kept[1], state, changes
                 if num_changes < 0 or (dirty[z] >> np.uint64(bit)) & np.uint64(1):
                     state[KNOWN] = 0
                 elif narrow and not (
-                    amend(num_changes, local, seen, rule, scratch) or one_line or not whole
+                    amend(num_changes, local, seen, rule, own)
+                    or one_line
+                    or not traces.whole[share, place]
                 ):
                     stale[z] &= ~(np.uint64(1) << np.uint64(bit))
                     continue
                 at = halo, min(margin, rule.largest), local, seen, rule
-                became = _estimate_row(at, normals, row, scratch)
-                keep(traces, share, row, -1 if became == WIDER else state[USED], scratch)
+                became = _estimate_row(at, normals, row, own)
+                keep(traces, share, place, -1 if became == WIDER else state[USED], own)
                 if became != WIDER:
                     stale[z] &= ~(np.uint64(1) << np.uint64(bit))
                     turned |= became == CHANGED
@@ -126,10 +130,12 @@ def _estimate_block(  # type: ignore[no-untyped-def]
 def _deepest(blocks, reach, block):  # type: ignore[no-untyped-def]
     """The largest reach of a block's voxels."""
     largest = np.uint8(0)
-    for local in range(512):
-        row = row_at(blocks, block, local)
-        if row >= 0:
-            largest = max(largest, reach[row])
+    for z in range(8):
+        word = blocks.occupied[block, z]
+        while word != np.uint64(0):
+            local = 64 * z + np.int64(trailing_zeros(word))
+            word &= word - np.uint64(1)
+            largest = max(largest, reach[row_at(blocks, block, local)])
     return largest
 
 
@@ -145,7 +151,7 @@ def _refresh(  # type: ignore[no-untyped-def]
     block always falls to the same share: the traces of its voxels lie there."""
     for share in prange(halos.rows.shape[0]):
         halo = Halo(halos.listed[share], halos.rows[share], halos.first[share], halos.near[share])
-        scratch = make_scratch(traces.keys.shape[2])
+        scratch = make_scratch()
         stale = np.zeros(8, np.uint64)
         for q in range(which.shape[0]):
             block = which[q]
@@ -158,7 +164,7 @@ def _refresh(  # type: ignore[no-untyped-def]
             turned[q] = False
             if counts[q] > 0:
                 blocks_out = (max(rule.start, deepest[1 + block]) + 7) >> 3
-                num = list_changes(blocks, columns, changes, halo.near, blocks_out, scratch[6])
+                num = list_changes(blocks, columns, changes, halo.near, blocks_out, scratch[4])
                 turned[q] = _estimate_block(
                     blocks, columns.observable, normals, block, stale, dirty[block], num, rule,
                     halo, traces, share, scratch,

@@ -55,14 +55,12 @@ def make_traces(shares: int) -> Traces:
 
 
 @kernel
-def make_scratch(most_kept):  # type: ignore[no-untyped-def]
-    """What a thread needs to estimate a voxel."""
+def make_scratch():  # type: ignore[no-untyped-def]
+    """What a thread needs to estimate voxels, beside the sums that are kept of each."""
     return (
         np.empty((LISTS, MOST + 16), np.int32),  # 16: columns start on different cache sets
         np.empty((COLUMNS, MOST + 16), np.int32),  # votes
         np.zeros(SUMS, np.int64),  # what was asked for
-        np.zeros(most_kept, np.int64),  # keys of the sums at hand
-        np.zeros((most_kept, SUMS), np.int64),  # these
         np.zeros(5, np.int64),  # KNOWN .. WHOLE
         np.zeros((5, MOST_CHANGES), np.int64),  # dirty voxels round a block: x, y, z from its
         # corner, observable before and now
@@ -153,39 +151,33 @@ def _remember(key, reach, scratch):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def recall(traces, share, row, scratch):  # type: ignore[no-untyped-def]
-    """Bring to hand what is kept of a voxel. Whether that is all that its last estimate asked
-    for."""
-    keys, kept, state = scratch[3], scratch[4], scratch[5]
-    state[KNOWN] = state[USED] = state[LISTED] = 0
-    state[WHOLE] = 1
-    place = traces.slot[row] - 1
-    if place < 0 or traces.owner[share, place] != row:
-        return False
-    state[KNOWN] = traces.number[share, place]
-    for e in range(state[KNOWN]):
-        keys[e] = traces.keys[share, place, e]
-        for s in range(SUMS):
-            kept[e, s] = traces.sums[share, place, e, s]
-    return traces.whole[share, place]
-
-
-@kernel(allocates=False)
-def keep(traces, share, row, used, scratch):  # type: ignore[no-untyped-def]
-    """Keep the sums of a voxel whose bits in `used` are set."""
-    keys, kept, state = scratch[3], scratch[4], scratch[5]
+def recall(traces, share, row, state):  # type: ignore[no-untyped-def]
+    """Begin with what is kept of a voxel. Its place, which may have been another's till now."""
     place = np.int64(traces.slot[row]) - 1
     if place < 0 or traces.owner[share, place] != row:
         place = traces.next[share]
         traces.next[share] = (place + 1) % traces.owner.shape[1]
         traces.owner[share, place] = row
+        traces.number[share, place] = 0
+        traces.whole[share, place] = False
         traces.slot[row] = place + 1
+    state[KNOWN] = traces.number[share, place]
+    state[USED] = state[LISTED] = 0
+    state[WHOLE] = 1
+    return place
+
+
+@kernel(allocates=False)
+def keep(traces, share, place, used, scratch):  # type: ignore[no-untyped-def]
+    """Keep those sums at hand whose bits in `used` are set."""
+    keys, kept, state = scratch[3], scratch[4], scratch[5]
     number = 0
     for e in range(state[KNOWN]):
         if (used >> e) & 1:
-            traces.keys[share, place, number] = keys[e]
-            for s in range(SUMS):
-                traces.sums[share, place, number, s] = kept[e, s]
+            if number < e:
+                keys[number] = keys[e]
+                for s in range(SUMS):
+                    kept[number, s] = kept[e, s]
             number += 1
     traces.number[share, place] = number
     traces.whole[share, place] = state[WHOLE] == 1
