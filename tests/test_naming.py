@@ -26,6 +26,7 @@ from facet_protocol.messages import Envelope, Rule
         ("facet/v1/map/robot/r1/tf_static", ("r1", "tf_static")),
         ("/velodyne/points 2", ("robot", "velodyne_points_2")),
         ("/7/velodyne/points", ("domain-7", "7_velodyne_points")),
+        ("/\u06f81/scan", ("robot", "1_scan")),  # a digit, but none of an id
         ("../..", ("robot", "scan")),
     ],
 )

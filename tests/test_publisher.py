@@ -174,9 +174,10 @@ def test_a_revision_from_another_life_gets_everything(rig: Rig) -> None:
     assert rig.snapshot(999).base_revision == 0
 
 
-def test_a_bad_question_is_told_so(rig: Rig) -> None:
-    answer = rig.ask(f"{snapshot_key('map')}?since=yesterday")
-    assert "yesterday" in answer.err.payload.to_string()
+@pytest.mark.parametrize("revision", ["yesterday", "\u06f1", "1" * 5000])
+def test_a_bad_question_is_told_so(rig: Rig, revision: str) -> None:
+    answer = rig.ask(f"{snapshot_key('map')}?since={revision}")
+    assert revision[:80] in answer.err.payload.to_string()
 
 
 def test_points_status_and_schema(rig: Rig) -> None:

@@ -150,3 +150,17 @@ def test_pace(monkeypatch: pytest.MonkeyPatch) -> None:
 
     assert len(list(paced(iter(room(3)), 2.0, lambda: now[0], sleep))) == 3
     assert slept == [0.05, 0.05]
+
+
+@pytest.mark.parametrize(
+    ("epoch", "read"),
+    [("4294967295", 2**32 - 1), ("4294967296", 0), ("\u06f1", 0), ("1" * 5000, 0)],
+)
+def test_an_epoch_is_a_number_of_32_bits_or_none(tmp_path: Path, epoch: str, read: int) -> None:
+    with (tmp_path / "a.mcap").open("wb") as file:
+        writer = Writer(file)
+        writer.start()
+        channel = writer.register_channel("/scan", "json", 0, {"epoch": epoch})
+        writer.add_message(channel, 1, b"{}", 1)
+        writer.finish()
+    assert [e.epoch for e in Recording([tmp_path / "a.mcap"])] == [read]

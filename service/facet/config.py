@@ -23,7 +23,7 @@ MIB = 1 << 20
 ENCRYPTED = ("tls/", "quic/")
 UNITS = {"m": "m", "deg": "degrees", "s": "s", "ms": "ms", "mb": "MiB", "bytes": "bytes"}
 OUT_OF_RANGE = ("greater_than", "greater_than_equal", "less_than", "less_than_equal")
-_PORT = re.compile(r".+:(\d{1,5})([?#].*)?")
+_PORT = re.compile(r".+:([0-9]{1,5})([?#].*)?")
 Id = Annotated[str, Field(pattern=r"^[A-Za-z0-9_-]{1,64}$")]
 
 

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import logging
 import queue
+import re
 import threading
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -21,6 +22,7 @@ logger = logging.getLogger(__name__)
 
 Command = Callable[[Mapping[str, str]], Mapping[str, Any]]
 MAX_QUESTIONS = 64
+_REVISION = re.compile(r"[0-9]{1,20}")
 
 
 class CommandError(Exception):
@@ -83,8 +85,8 @@ class Answers:
 
     def _snapshot(self, query: Any) -> None:
         since = query.parameters.get("since", "0")
-        if not since.isdecimal():
-            _refuse(query, f"since={since!r} is not a revision")
+        if _REVISION.fullmatch(since) is None:
+            _refuse(query, f"since={since[:80]!r} is not a revision")
             return
         schema, payload = encode(self._snapshots.since(int(since)))
         query.reply(topics.snapshot_key(self._map_id), payload, encoding=encoding_of(schema))

@@ -21,7 +21,7 @@ from facet_protocol.topics import PREFIX
 TOKENS_KEY = "@/*/@ros2_lv/MP/*/*/*"  # who publishes what: kept by the bridge as long as it does
 MAX_KNOWN = 4096  # keys that are remembered; a stranger cannot make them grow for ever
 
-_RMW_KEY = re.compile(r"(\d{1,4})/(.+)/(\w+::msg::dds_::\w+_)/([^/]+)")
+_RMW_KEY = re.compile(r"([0-9]{1,4})/(.+)/(\w+::msg::dds_::\w+_)/([^/]+)")
 _TOKEN = re.compile(r"@/[^/]+/@ros2_lv/MP/([^/]+)/([^/]+)/[^/]*")
 
 

@@ -15,7 +15,7 @@ FOREIGN_ROBOT = "robot"  # who drove, where the topic does not say
 TRANSFORM_SCHEMAS = (*ROS_TRANSFORMS, "foxglove.FrameTransform", "foxglove.FrameTransforms")
 POSE_SCHEMAS = (*ROS_POSES, "foxglove.PoseInFrame")  # of what, only a rule or the key says
 
-_DOMAIN = re.compile(r"/(\d+)/")
+_DOMAIN = re.compile(r"/([0-9]+)/")
 
 
 @lru_cache(maxsize=1024)  # asked several times for each message, of few keys

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
@@ -11,6 +12,8 @@ from facet.sources.mcap_stream import LogMessage, McapStream
 from facet.sources.naming import is_input
 from facet_protocol import topics
 from facet_protocol.messages import Envelope
+
+_U32 = re.compile(r"[0-9]{1,10}")
 
 
 class Recording:
@@ -126,4 +129,6 @@ def _files(path: Path) -> list[Path]:
 
 
 def _number(text: str | None) -> int:
-    return int(text) if text and text.isdecimal() else 0
+    """A number of 32 bits; 0 for anything else that a channel of another's may say."""
+    number = int(text) if text is not None and _U32.fullmatch(text) else 0
+    return number if number < 1 << 32 else 0
