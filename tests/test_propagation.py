@@ -31,7 +31,7 @@ RARE = (  # limits below which a path is not taken, and what they are set to
     (claims, "FEW", 1),
     (pivot, "FEW", 1),
     (normals, "SHARES", 3),
-    (traces, "PLACES", 5),
+    (traces, "ENTRIES", 13),
     (traces, "MOST_KEPT", 3),
     (runs, "SHARES", 3),
 )

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from facet.mapping.adaptive import make_rule
 from facet.mapping.mapper import Mapper
 from facet.mapping.settings import MapSettings
-from facet.mapping.traces import CUBE, SLAB, SLAB_UNIT
+from facet.mapping.traces import CUBE, KEY, NUMBER, OWNER, SLAB, SLAB_UNIT
 from facet_protocol.messages import Scan
 from mapping_logs import cloud
 
@@ -76,14 +76,14 @@ def kept(mapper: Mapper) -> list[tuple[tuple[int, int, int], int, list[int]]]:
     """(voxel, key, sum) of all that is kept."""
     own, traces = mapper._store, mapper._normals._traces
     told = []
-    for share, place in np.argwhere(traces.number > 0).tolist():
-        row = int(traces.owner[share, place])
-        if traces.slot[row] != place + 1:
+    for share, begin in np.argwhere(traces.entries[..., OWNER] > 0).tolist():
+        row = int(traces.entries[share, begin, OWNER]) - 1
+        if traces.slot[row] != begin + 1:
             continue
         (voxel,) = map(tuple, own.voxel_keys(np.array([row], np.int32)).tolist())
-        for e in range(int(traces.number[share, place])):
-            key, total = int(traces.keys[share, place, e]), traces.sums[share, place, e].tolist()
-            told.append((voxel, key, total))
+        number = int(traces.entries[share, begin, NUMBER])
+        entries = traces.entries[share, begin : begin + number].tolist()
+        told.extend((voxel, entry[KEY], entry[:KEY]) for entry in entries)
     return told
 
 
@@ -110,14 +110,13 @@ def test_what_is_kept_is_what_would_be_summed_anew() -> None:
 def test_what_is_kept_is_used() -> None:
     """Else nothing here could fail: sums that are made false make the next normals false."""
     mapper, fresh = Mapper(SETTINGS), Mapper(SETTINGS)
-    for seed in range(8):
-        mapper.insert(room(seed))
+    scans = [*(room(seed) for seed in range(8)), room(200, 20), room(201, 20)]
+    for scan in scans:
+        if scan is scans[-1]:
+            mapper._normals._traces.entries[..., 5:KEY] //= 2
+        mapper.insert(scan)
         mapper.update()
-    mapper._normals._traces.sums[..., 5:] //= 2
-    mapper.insert(room(200, 20))
-    mapper.update()
-    for seed in (*range(8), 200):
-        fresh.insert(room(seed, 20) if seed == 200 else room(seed))
+        fresh.insert(scan)
     fresh.update()
     assert mapper.digest().state == fresh.digest().state
     wrong, right = (dict(normals_of(m)) for m in (mapper, fresh))

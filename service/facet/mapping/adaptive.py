@@ -120,7 +120,7 @@ def _step(sums, r, rule):  # type: ignore[no-untyped-def]
 def _find_radius(at, rule, scratch):  # type: ignore[no-untyped-def]
     """Follow the radius until it repeats; of a cycle the smallest. (radius, reach): reach is the
     largest radius that was looked at; radius 0 where it would leave the halo."""
-    sums, state = scratch[2], scratch[5]
+    sums, state = scratch[2], scratch[4]
     r = rule.start
     reach = r
     visited = np.int64(0)
@@ -145,7 +145,7 @@ def estimate(at, scratch):  # type: ignore[no-untyped-def]
 
     at: halo, its margin, the voxel's place in the block, its observable, rule."""
     _, _, _, seen, rule = at
-    lists, votes, sums, _, _, state, _ = scratch
+    lists, votes, sums, _, state, _ = scratch
     if seen == 0:
         return EMPTY, 0, 0, 0, 0, False, 0
     r, reach = _find_radius(at, rule, scratch)

@@ -29,9 +29,10 @@ from facet.mapping.settings import MapSettings
 from facet.mapping.staleness import find_candidates, find_stale, mark_dirty
 from facet.mapping.store import Dirty, VoxelStore
 from facet.mapping.traces import (
-    KNOWN,
     USED,
     amend,
+    begin,
+    forget,
     keep,
     list_changes,
     make_scratch,
@@ -88,8 +89,7 @@ def _estimate_block(  # type: ignore[no-untyped-def]
     Whether any changed. Few need to look far: the wider halos are gathered for them alone.
 
     dirty (8,): bits of its dirty voxels; num_changes: dirty voxels round it, -1: too many."""
-    turned = False
-    lists, votes, sums, state, changes = scratch
+    turned, state = False, scratch[4]
     for narrow, margin in ((True, NARROW), (False, WIDE), (False, rule.largest)):
         left = np.uint64(0)
         gather(blocks, observable, block, min(margin, rule.largest), halo)
@@ -102,21 +102,22 @@ def _estimate_block(  # type: ignore[no-untyped-def]
                 row = row_at(blocks, block, local)
                 seen = observable[row]
                 one_line = seen >> 32 != 0  # asks for more than sums
-                place = recall(traces, share, row, state)
-                kept = traces.keys[share, place], traces.sums[share, place]
-                own = lists, votes, sums, kept[0], kept[1], state, changes
-                if num_changes < 0 or (dirty[z] >> np.uint64(bit)) & np.uint64(1):
-                    state[KNOWN] = 0
-                elif narrow and not (
-                    amend(num_changes, local, seen, rule, own)
-                    or one_line
-                    or not traces.whole[share, place]
-                ):
-                    stale[z] &= ~(np.uint64(1) << np.uint64(bit))
-                    continue
+                is_new = num_changes < 0 or (dirty[z] >> np.uint64(bit)) & np.uint64(1) == 1
+                if is_new:
+                    begin(state)
+                else:
+                    is_whole = recall(traces, share, row, scratch)
+                    if narrow and not (
+                        amend(num_changes, local, seen, rule, scratch) or one_line or not is_whole
+                    ):
+                        stale[z] &= ~(np.uint64(1) << np.uint64(bit))
+                        continue
                 at = halo, min(margin, rule.largest), local, seen, rule
-                became = _estimate_row(at, normals, row, own)
-                keep(traces, share, place, -1 if became == WIDER else state[USED], own)
+                became = _estimate_row(at, normals, row, scratch)
+                if num_changes < 0:
+                    forget(traces, share, row)
+                else:
+                    keep(traces, share, row, -1 if became == WIDER else state[USED], scratch)
                 if became != WIDER:
                     stale[z] &= ~(np.uint64(1) << np.uint64(bit))
                     turned |= became == CHANGED
@@ -164,7 +165,7 @@ def _refresh(  # type: ignore[no-untyped-def]
             turned[q] = False
             if counts[q] > 0:
                 blocks_out = (max(rule.start, deepest[1 + block]) + 7) >> 3
-                num = list_changes(blocks, columns, changes, halo.near, blocks_out, scratch[4])
+                num = list_changes(blocks, columns, changes, halo.near, blocks_out, scratch[5])
                 turned[q] = _estimate_block(
                     blocks, columns.observable, normals, block, stale, dirty[block], num, rule,
                     halo, traces, share, scratch,

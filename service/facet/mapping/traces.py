@@ -22,45 +22,48 @@ SLAB_UNIT = 64  # the normal across a slab is rounded: these integers are a unit
 CUBE, SLAB, THIN_SLAB = range(3)  # what a key asks for
 FARTHEST = 9  # (2 x 9 + 1)^3 votes are always listed whole; of wider regions nothing is kept
 MOST_KEPT = 12  # sums of a voxel
-PLACES = 8192  # voxels of a share whose sums are kept: the last ones that were estimated
+ENTRIES = 96 << 10  # sums of a share that are kept: those begun last
 MOST_CHANGES = 256  # dirty voxels round a block; with more, summing all again is no slower
 KNOWN, USED, LISTED, COUNT, WHOLE = range(5)  # state: sums at hand; a bit each of those asked for;
 # radius up to which the votes are listed; how many these are; whether nothing asked for was dropped
+ENTRY = 16  # numbers of an entry, a cache line: the sums and
+KEY = SUMS  # what they are of
+# and, where those of a voxel begin, else 0
+OWNER = 12  # 1 + row
+ROOM = 13  # how many have room
+NUMBER = 14  # how many there are
+IS_WHOLE = 15  # whether they are all that the last estimate asked for
 _VOTE = 0xFFFF  # bits of an observable that a sum is made of: centroid and weight
 
 
 class Traces(NamedTuple):
-    """The sums of the voxels estimated last, by share: threads never write the same."""
+    """The sums of the voxels estimated last, by share: threads never write the same.
 
-    slot: NDArray[np.int32]  # (V,) place of a voxel in its share + 1; 0: never had one
-    owner: NDArray[np.int32]  # (S, PLACES) row that the place belongs to
-    number: NDArray[np.uint8]  # (S, PLACES) sums that are kept
-    whole: NDArray[np.bool_]  # (S, PLACES) all that the last estimate asked for are
-    keys: NDArray[np.int32]  # (S, PLACES, MOST_KEPT)
-    sums: NDArray[np.int32]  # (S, PLACES, MOST_KEPT, SUMS)
-    next: NDArray[np.int64]  # (S,) the place that is given away next
+    A share is a ring. The sums of a voxel lie one behind the other; once the ring has come round
+    they are overwritten from the first on, which says whose they are."""
+
+    slot: NDArray[np.int32]  # (V,) 1 + where in its share a voxel's sums begin; 0: never had any
+    entries: NDArray[np.int32]  # (S, ENTRIES, ENTRY) a sum, its key, and OWNER .. IS_WHOLE
+    next: NDArray[np.int64]  # (S,) where the ring is written next
 
 
 def make_traces(shares: int) -> Traces:
-    """Room for the sums of shares x PLACES voxels; what is not used takes no memory."""
+    """Room for shares x ENTRIES sums; what is not used takes no memory."""
     return Traces(
         np.zeros(0, np.int32),
-        np.zeros((shares, PLACES), np.int32),
-        np.zeros((shares, PLACES), np.uint8),
-        np.zeros((shares, PLACES), np.bool_),
-        np.zeros((shares, PLACES, MOST_KEPT), np.int32),
-        np.zeros((shares, PLACES, MOST_KEPT, SUMS), np.int32),
+        np.zeros((shares, ENTRIES, ENTRY), np.int32),
         np.zeros(shares, np.int64),
     )
 
 
 @kernel
 def make_scratch():  # type: ignore[no-untyped-def]
-    """What a thread needs to estimate voxels, beside the sums that are kept of each."""
+    """What a thread needs to estimate voxels."""
     return (
         np.empty((LISTS, MOST + 16), np.int32),  # 16: columns start on different cache sets
         np.empty((COLUMNS, MOST + 16), np.int32),  # votes
         np.zeros(SUMS, np.int64),  # what was asked for
+        np.zeros((MOST_KEPT, ENTRY), np.int32),  # sums at hand, each with its key
         np.zeros(5, np.int64),  # KNOWN .. WHOLE
         np.zeros((5, MOST_CHANGES), np.int64),  # dirty voxels round a block: x, y, z from its
         # corner, observable before and now
@@ -88,7 +91,7 @@ def _read_key(key):  # type: ignore[no-untyped-def]
 def list_votes(at, reach, scratch):  # type: ignore[no-untyped-def]
     """List the votes within reach. Whether the halo is wide enough."""
     halo, margin, local, seen, _ = at
-    lists, votes, state = scratch[0], scratch[1], scratch[5]
+    lists, votes, state = scratch[0], scratch[1], scratch[4]
     if state[LISTED] >= reach:
         return True
     if reach > margin:
@@ -106,9 +109,9 @@ def ask(at, key, reach, scratch):  # type: ignore[no-untyped-def]
 
     at: halo, its margin, the voxel's place in the block, its observable, rule; reach: the largest
     radius that was asked for, up to which votes are listed."""
-    _, votes, sums, keys, kept, state, _ = scratch
+    _, votes, sums, kept, state, _ = scratch
     for e in range(state[KNOWN]):
-        if keys[e] == key:
+        if kept[e, KEY] == key:
             state[USED] |= 1 << e
             for s in range(SUMS):
                 sums[s] = kept[e, s]
@@ -129,12 +132,12 @@ def ask(at, key, reach, scratch):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=False)
 def _remember(key, reach, scratch):  # type: ignore[no-untyped-def]
-    _, _, sums, keys, kept, state, _ = scratch
+    _, _, sums, kept, state, _ = scratch
     e = state[KNOWN]
     if reach > FARTHEST:
         state[WHOLE] = 0
         return
-    most = keys.shape[0]
+    most = kept.shape[0]
     if e < most:
         state[KNOWN] += 1
     else:
@@ -145,42 +148,89 @@ def _remember(key, reach, scratch):  # type: ignore[no-untyped-def]
             state[WHOLE] = 0
             return
     state[USED] |= 1 << e
-    keys[e] = key
+    kept[e, KEY] = key
     for s in range(SUMS):
         kept[e, s] = sums[s]
 
 
 @kernel(allocates=False)
-def recall(traces, share, row, state):  # type: ignore[no-untyped-def]
-    """Begin with what is kept of a voxel. Its place, which may have been another's till now."""
-    place = np.int64(traces.slot[row]) - 1
-    if place < 0 or traces.owner[share, place] != row:
-        place = traces.next[share]
-        traces.next[share] = (place + 1) % traces.owner.shape[1]
-        traces.owner[share, place] = row
-        traces.number[share, place] = 0
-        traces.whole[share, place] = False
-        traces.slot[row] = place + 1
-    state[KNOWN] = traces.number[share, place]
-    state[USED] = state[LISTED] = 0
+def begin(state):  # type: ignore[no-untyped-def]
+    """Nothing is at hand."""
+    state[KNOWN] = state[USED] = state[LISTED] = 0
     state[WHOLE] = 1
-    return place
 
 
 @kernel(allocates=False)
-def keep(traces, share, place, used, scratch):  # type: ignore[no-untyped-def]
+def _find_record(traces, share, row):  # type: ignore[no-untyped-def]
+    """Where in its share the sums of a voxel begin, -1: it has none."""
+    start = np.int64(traces.slot[row]) - 1
+    if start >= 0 and traces.entries[share, start, OWNER] != row + 1:
+        return -1
+    return start
+
+
+@kernel(allocates=False)
+def recall(traces, share, row, scratch):  # type: ignore[no-untyped-def]
+    """Bring what is kept of a voxel to hand. Whether it is all that the last estimate asked for."""
+    kept, state = scratch[3], scratch[4]
+    begin(state)
+    start = _find_record(traces, share, row)
+    if start < 0:
+        return False
+    entries = traces.entries[share]
+    state[KNOWN] = entries[start, NUMBER]
+    for e in range(state[KNOWN]):
+        for s in range(ENTRY):
+            kept[e, s] = entries[start + e, s]
+    return entries[start, IS_WHOLE] == 1
+
+
+@kernel(allocates=False)
+def keep(traces, share, row, used, scratch):  # type: ignore[no-untyped-def]
     """Keep those sums at hand whose bits in `used` are set."""
-    keys, kept, state = scratch[3], scratch[4], scratch[5]
+    kept, state = scratch[3], scratch[4]
     number = 0
     for e in range(state[KNOWN]):
         if (used >> e) & 1:
             if number < e:
-                keys[number] = keys[e]
-                for s in range(SUMS):
+                for s in range(ENTRY):
                     kept[number, s] = kept[e, s]
             number += 1
-    traces.number[share, place] = number
-    traces.whole[share, place] = state[WHOLE] == 1
+    entries = traces.entries[share]
+    start = _find_record(traces, share, row)
+    if start < 0 or entries[start, ROOM] < number:
+        start = _begin_record(traces, share, row, number)
+    room = entries[start, ROOM]
+    for e in range(number):
+        kept[e, OWNER] = 0
+        for s in range(ENTRY):
+            entries[start + e, s] = kept[e, s]
+    entries[start, OWNER] = row + 1
+    entries[start, ROOM] = room
+    entries[start, NUMBER] = number
+    entries[start, IS_WHOLE] = state[WHOLE]
+
+
+@kernel(allocates=False)
+def _begin_record(traces, share, row, number):  # type: ignore[no-untyped-def]
+    """Room for the sums of a voxel, some more than now, in place of the oldest. Where it begins."""
+    start, room = traces.next[share], min(number + 1, MOST_KEPT)
+    if start + room > traces.entries.shape[1]:
+        start = 0
+    traces.next[share] = start + room
+    for e in range(start, start + room):
+        traces.entries[share, e, OWNER] = 0
+    traces.entries[share, start, ROOM] = room
+    traces.slot[row] = start + 1
+    return start
+
+
+@kernel(allocates=False)
+def forget(traces, share, row):  # type: ignore[no-untyped-def]
+    """Keep nothing of a voxel."""
+    start = _find_record(traces, share, row)
+    if start >= 0:
+        traces.entries[share, start, OWNER] = 0
 
 
 @kernel(allocates=False)
@@ -214,10 +264,10 @@ def list_changes(blocks, columns, dirty, near, blocks_out, changes):  # type: ig
 def amend(num_changes, local, seen, rule, scratch):  # type: ignore[no-untyped-def]
     """Bring the sums at hand from what the changed voxels were to what they are. Whether any sum is
     another now."""
-    keys, state, changes = scratch[3], scratch[5], scratch[6]
+    kept, state, changes = scratch[3], scratch[4], scratch[5]
     farthest = 0
     for e in range(state[KNOWN]):
-        farthest = max(farthest, keys[e] & 31)
+        farthest = max(farthest, kept[e, KEY] & 31)
     x, y, z = local & 7, (local >> 3) & 7, local >> 6
     different = False
     for d in range(num_changes):
@@ -227,10 +277,11 @@ def amend(num_changes, local, seen, rule, scratch):  # type: ignore[no-untyped-d
             continue
         before, now = changes[3, d], changes[4, d]
         for e in range(state[KNOWN]):
-            if keys[e] & 31 < distance:
+            key = kept[e, KEY]
+            if key & 31 < distance:
                 continue
-            was = _counts(dx, dy, dz, before, keys[e], seen, rule)
-            counts = _counts(dx, dy, dz, now, keys[e], seen, rule)
+            was = _counts(dx, dy, dz, before, key, seen, rule)
+            counts = _counts(dx, dy, dz, now, key, seen, rule)
             if was and counts and (before ^ now) & _VOTE == 0:
                 continue
             if was:
@@ -260,7 +311,7 @@ def _counts(dx, dy, dz, word, key, seen, rule):  # type: ignore[no-untyped-def]
 @kernel(allocates=False)
 def _add_vote(dx, dy, dz, word, sign, e, scratch):  # type: ignore[no-untyped-def]
     """Add a vote to one of the sums at hand, or take it out."""
-    kept = scratch[4]
+    kept = scratch[3]
     x, y, z = 8 * dx + (word & 15), 8 * dy + ((word >> 4) & 15), 8 * dz + ((word >> 8) & 15)
     w = sign * ((word >> 12) & 15)
     kept[e, 0] += sign
