@@ -254,10 +254,10 @@ def _bridged(columns, count, q, tolerance):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=False)
 def _claim(found, near, count, tolerance, own):  # type: ignore[no-untyped-def]
-    """Candidate of the first `near`, at an angle to `own`, that claims the voxel in turn as a
-    corner, or as a threshold with the help of any of the `count`.
+    """Candidate of the first `near`, at an angle to `own`, that claims the voxel in turn at the
+    least cost: as a corner, or as a threshold with the help of any of the `count`.
 
-    Returns (candidate, -1: none; whether one was left out for want of the other jamb)."""
+    Returns (candidate, -1: none; whether a better one was left out for want of the other jamb)."""
     columns, angled = found.columns, found.angled
     if found.num_angled[own] < 0:
         number = 0
@@ -266,19 +266,40 @@ def _claim(found, near, count, tolerance, own):  # type: ignore[no-untyped-def]
                 angled[own, number] = q
                 number += 1
         found.num_angled[own] = number
-    best, best_cost, alone = -1, np.inf, False
+    best, best_cost = _best_corner(columns, angled[own], found.num_angled[own], tolerance)
+    alone = False
     for a in range(found.num_angled[own]):
         q = angled[own, a]
         if columns[OFF, q] > tolerance:
             continue
         gap = _gap(columns, q)
-        if gap > 8 * CLAIM_REACH and not _bridged(columns, count, q, tolerance):
+        if gap <= 8 * CLAIM_REACH:
+            continue
+        cost = _cost(columns, q, gap, tolerance)
+        if cost > best_cost or (cost == best_cost and q > best):
+            continue
+        if _bridged(columns, count, q, tolerance):
+            best, best_cost = q, cost
+        else:
             alone = True
+    return best, alone
+
+
+@kernel(allocates=False)
+def _best_corner(columns, angled, number, tolerance):  # type: ignore[no-untyped-def]
+    """(candidate, cost) of those beside the voxel in turn; (-1, infinity) where none is."""
+    best, best_cost = -1, np.inf
+    for a in range(number):
+        q = angled[a]
+        if columns[OFF, q] > tolerance:
+            continue
+        gap = _gap(columns, q)
+        if gap > 8 * CLAIM_REACH:
             continue
         cost = _cost(columns, q, gap, tolerance)
         if cost < best_cost:
             best, best_cost = q, cost
-    return best, alone
+    return best, best_cost
 
 
 @kernel(allocates=False)
