@@ -19,6 +19,7 @@ LEFTOVER_REACH = 8  # voxels between a leftover and the box of the patch it join
 CLAIM_REACH = 2  # voxels between a corner voxel and the box of a patch that claims it too
 PARALLEL_COS = 0.98
 HALF = 32.0  # 1/8 voxels: half a block
+OFFSET_STEP = 0.25  # 1/8 voxels: to so much the offset of a patch from there is rounded
 CHUNK = 16  # blocks that a thread takes at a time
 FEW = 128  # blocks that are not worth waking other threads for
 CORNER_COS = 0.8  # planes that share a corner voxel differ by more than 37 degrees
@@ -96,26 +97,17 @@ def _add_candidates(patches, places, num_places, tolerance, count, found):  # ty
         for p in range(patches.number[other]):
             if count == codes.shape[0]:
                 return count
-            votes = float(patches.votes[other, p])
-            ux, uy, uz = (
-                float(patches.unit[other, p, 0]),
-                float(patches.unit[other, p, 1]),
-                float(patches.unit[other, p, 2]),
-            )
+            plane = patches.plane[other, p]
+            ux, uy, uz = float(plane[0]), float(plane[1]), float(plane[2])
             one = 1.0 / np.sqrt(ux * ux + uy * uy + uz * uz)
             ux, uy, uz = ux * one, uy * one, uz * one
-            size = 1.0 / votes
-            offset = (
-                ux * (patches.centroid[other, p, 0] * size + sx)
-                + uy * (patches.centroid[other, p, 1] * size + sy)
-                + uz * (patches.centroid[other, p, 2] * size + sz)
-            )
+            offset = plane[3] * OFFSET_STEP + ux * (HALF + sx) + uy * (HALF + sy) + uz * (HALF + sz)
             beyond = abs(HALF * (ux + uy + uz) - offset) - HALF * (abs(ux) + abs(uy) + abs(uz))
             if beyond > tolerance:
                 continue
             columns[NX, count], columns[NY, count], columns[NZ, count] = ux, uy, uz
             columns[OFFSET, count] = offset
-            columns[WEIGHT, count] = 1.0 / (1.0 + votes)
+            columns[WEIGHT, count] = 1.0 / (1 << plane[4])
             columns[LOW, count] = 8 * patches.box[other, p, 0] + sx
             columns[LOW + 1, count] = 8 * patches.box[other, p, 1] + sy
             columns[LOW + 2, count] = 8 * patches.box[other, p, 2] + sz

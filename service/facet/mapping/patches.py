@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from facet.mapping.bits import trailing_zeros
 from facet.mapping.blocks import CENTRE, row_at
-from facet.mapping.claims import find_dependents, label_blocks
+from facet.mapping.claims import HALF, OFFSET_STEP, find_dependents, label_blocks
 from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory
@@ -42,6 +42,7 @@ class Patches(NamedTuple):
     scatter: NDArray[np.int32]  # (.., 6) sum of their products xx, xy, xz, yy, yz, zz
     unit: NDArray[np.int32]  # (.., 3) sum of the members' normals, times UNIT
     box: NDArray[np.int8]  # (.., 6) least and largest local x, y, z of the members
+    plane: NDArray[np.int16]  # (.., 5) as the labels of voxels see it, see _round_plane
     rung: NDArray[np.int8]  # of sigma_N
     counted: NDArray[np.int16]  # votes that stand in the histogram of rungs
     far: NDArray[np.bool_]  # (B,) the block's labels depend on patches two blocks away, not one
@@ -67,6 +68,7 @@ def empty_patches() -> Patches:
         scatter=np.zeros((*shape, 6), np.int32),
         unit=np.zeros((*shape, 3), np.int32),
         box=np.zeros((*shape, 6), np.int8),
+        plane=np.zeros((*shape, 5), np.int16),
         rung=np.zeros(shape, np.int8),
         counted=np.zeros(shape, np.int16),
         far=np.zeros(0, np.bool_),
@@ -156,42 +158,60 @@ def _group(blocks, observable, normals, patches, block, grouping, scratch):  # t
 
 
 @kernel(allocates=False)
+def _round_plane(votes, centroid, unit, plane):  # type: ignore[no-untyped-def]
+    """A patch as the labels of voxels see it: its normal in 128ths, its offset from the middle of
+    the block in OFFSET_STEP, and the bit length of its votes. Most changes of its members leave
+    it as it is. Writes plane (5,); whether it is another now."""
+    u = unit[0], unit[1], unit[2]
+    scale = 128.0 / np.sqrt(float(u[0] * u[0] + u[1] * u[1] + u[2] * u[2]))
+    x, y, z = np.rint(u[0] * scale), np.rint(u[1] * scale), np.rint(u[2] * scale)
+    along = (
+        x * (centroid[0] / votes - HALF)
+        + y * (centroid[1] / votes - HALF)
+        + z * (centroid[2] / votes - HALF)
+    ) / np.sqrt(x * x + y * y + z * z)
+    size = 0
+    while votes >> size:
+        size += 1
+    changed = False
+    for a, value in enumerate((x, y, z, np.rint(along / OFFSET_STEP), float(size))):
+        changed |= plane[a] != value
+        plane[a] = np.int16(value)
+    return changed
+
+
+@kernel(allocates=False)
 def _store(blocks, patches, block, count, scratch):  # type: ignore[no-untyped-def]
-    """Write a block's grouping. Returns whether it differs from what was there."""
+    """Write a block's grouping. Whether it differs from what was there, and whether for the labels
+    of other blocks."""
     votes, centroid, scatter, unit, box, label = scratch
-    changed = patches.number[block] != count
+    changed = shows = patches.number[block] != count
     patches.number[block] = count
     for p in range(count):
-        if patches.votes[block, p] != votes[p]:
-            changed = True
+        changed |= patches.votes[block, p] != votes[p]
         patches.votes[block, p] = votes[p]
         for a in range(3):
-            if (
-                patches.centroid[block, p, a] != centroid[p, a]
-                or patches.unit[block, p, a] != unit[p, a]
-            ):
-                changed = True
+            changed |= patches.centroid[block, p, a] != centroid[p, a]
+            changed |= patches.unit[block, p, a] != unit[p, a]
             patches.centroid[block, p, a] = centroid[p, a]
             patches.unit[block, p, a] = unit[p, a]
         for a in range(6):
-            if (
-                patches.scatter[block, p, a] != scatter[p, a]
-                or patches.box[block, p, a] != box[p, a]
-            ):
-                changed = True
+            changed |= patches.scatter[block, p, a] != scatter[p, a]
+            shows |= patches.box[block, p, a] != box[p, a]
             patches.scatter[block, p, a] = scatter[p, a]
             patches.box[block, p, a] = box[p, a]
+        shows |= _round_plane(votes[p], centroid[p], unit[p], patches.plane[block, p])
     for local in range(512):
         row = row_at(blocks, block, local)
         if row >= 0 and patches.member[row] != label[local]:
             patches.member[row] = label[local]
             changed = True
-    return changed
+    return changed | shows, shows
 
 
 @kernel
 def _group_some(  # type: ignore[no-untyped-def]
-    blocks, observable, normals, patches, which, start, stop, grouping, changed
+    blocks, observable, normals, patches, which, start, stop, grouping, changed, shows
 ):
     scratch = (
         np.zeros(PER_BLOCK, np.int64),
@@ -203,15 +223,19 @@ def _group_some(  # type: ignore[no-untyped-def]
     )
     for q in range(start, stop):
         count = _group(blocks, observable, normals, patches, which[q], grouping, scratch)
-        changed[q] = _store(blocks, patches, which[q], count, scratch)
+        changed[q], shows[q] = _store(blocks, patches, which[q], count, scratch)
 
 
 @kernel(parallel=True)
-def _group_all(blocks, observable, normals, patches, which, grouping, changed):  # type: ignore[no-untyped-def]
+def _group_all(  # type: ignore[no-untyped-def]
+    blocks, observable, normals, patches, which, grouping, changed, shows
+):
     size = (which.shape[0] + SHARES - 1) // SHARES  # blocks beside one another share cache lines
     for share in prange(SHARES):
         start, stop = share * size, min(which.shape[0], (share + 1) * size)
-        _group_some(blocks, observable, normals, patches, which, start, stop, grouping, changed)
+        _group_some(
+            blocks, observable, normals, patches, which, start, stop, grouping, changed, shows
+        )
 
 
 @kernel(allocates=False)
@@ -318,14 +342,13 @@ class PatchField:
         Returns blocks: (patches changed), (labels changed)."""
         self._fit(store)
         block_of = store.columns.block
-        changed = np.empty(len(dirty), np.bool_)
+        changed, shows = np.empty(len(dirty), np.bool_), np.empty(len(dirty), np.bool_)
         sources = store.blocks, store.columns.observable, normals, self.patches
         if len(dirty) < FEW:
-            _group_some(*sources, dirty, 0, len(dirty), self._grouping, changed)
+            _group_some(*sources, dirty, 0, len(dirty), self._grouping, changed, shows)
         else:
-            _group_all(*sources, dirty, self._grouping, changed)
-        regrouped = dirty[changed]
-        near = np.union1d(self._around(store, regrouped), dirty)
+            _group_all(*sources, dirty, self._grouping, changed, shows)
+        near = np.union1d(self._around(store, dirty[shows]), dirty)
         relabelled = np.zeros(len(near), np.bool_)
         label_blocks(
             store.blocks, store.columns.observable, self.patches, near, self._grouping.leftover,
@@ -334,7 +357,7 @@ class PatchField:
         relabelled_blocks = near[relabelled]
         touched = np.union1d(block_of[touched_rows], np.union1d(dirty, relabelled_blocks))
         self._sum(store, normals, touched)
-        return regrouped, relabelled_blocks
+        return dirty[changed], relabelled_blocks
 
     def _sum(self, store: VoxelStore, normals: Normals, which: NDArray[np.int32]) -> None:
         """Point moments and rungs of the blocks `which`, and what they change of the histogram."""
