@@ -22,7 +22,7 @@ from facet.mapping.memory import Heap, Memory
 from facet.mapping.normals import VALID, Normals
 from facet.mapping.settings import STEPS, MapSettings
 from facet.mapping.store import VoxelStore
-from facet.mapping.sums import MOMENTS, SUMS, read_sums, shift_moments
+from facet.mapping.sums import MOMENTS, SUMS, count_points, read_sums, shift_moments
 
 PER_BLOCK = 12  # patches of a block; what finds no place is a leftover
 RUNGS = 40
@@ -239,26 +239,44 @@ def _group_all(  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _add_points(blocks, columns, border, patches, block, pure, m, total, sums):  # type: ignore[no-untyped-def]
+def _list_members(blocks, border, patches, block, members):  # type: ignore[no-untyped-def]
+    """List the voxels that go with a patch of their own block, as members (4, 512): row, place in
+    the block, patch, and whether they are pure: not at a border, and claimed by no plane at an
+    angle. How many. One look-up at a time for all of them: they do not wait for one another."""
+    rows, places, owners, are_pure = members[0], members[1], members[2], members[3]
+    occupied = 0
+    for place in range(64):
+        line = blocks.lines[block, place]
+        if line == 0:
+            continue
+        for x in range(8):
+            rows[occupied] = blocks.rows[line, x] - 1
+            places[occupied] = 8 * place + x
+            occupied += rows[occupied] >= 0
+    count = 0
+    for v in range(occupied):
+        row = rows[v]
+        label = np.int64(patches.label[row])
+        rows[count], places[count], owners[count] = row, places[v], label & 15
+        are_pure[count] = not border[row] and patches.second[row] < 0
+        count += label >> 4 == CENTRE
+    return count
+
+
+@kernel(allocates=False)
+def _add_points(columns, members, count, all_of_them, m, total, sums):  # type: ignore[no-untyped-def]
     """Sum the members' point moments about the block corner into m (PER_BLOCK, 10): of all, or
-    only of `pure` ones: not at a border, and claimed by no plane at an angle. Count the points of
-    all members in total (PER_BLOCK,)."""
+    only of pure ones. Count the points of all members in total (PER_BLOCK,)."""
     m[:] = 0
     total[:] = 0
-    for z in range(8):
-        word = blocks.occupied[block, z]
-        while word != np.uint64(0):
-            bit = np.int64(trailing_zeros(word))
-            word &= word - np.uint64(1)
-            row = row_at(blocks, block, 64 * z + bit)
-            own_label = patches.label[row]
-            if own_label >> 4 != CENTRE:
-                continue
-            p = own_label & 15
+    for v in range(count):
+        row, place, p = members[0, v], members[1, v], members[2, v]
+        if all_of_them or members[3, v]:
             read_sums(columns, row, sums)
+            shift_moments(sums, place & 7, (place >> 3) & 7, place >> 6, m[p])
             total[p] += sums[0]
-            if not (pure and (border[row] or patches.second[row] >= 0)):
-                shift_moments(sums, bit & 7, bit >> 3, z, m[p])
+        else:
+            total[p] += count_points(columns, row)
 
 
 @kernel(allocates=False)
@@ -281,12 +299,14 @@ def _sum_some(blocks, columns, border, patches, which, start, stop, rungs, histo
     whole = np.empty((PER_BLOCK, MOMENTS), np.int64)
     total = np.empty(PER_BLOCK, np.int64)
     sums, spread = np.empty(SUMS, np.int64), np.empty(6)
+    members = np.empty((4, 512 + 16), np.int64)  # 16: columns start on different cache sets
     for q in range(start, stop):
         block = which[q]
-        _add_points(blocks, columns, border, patches, block, True, pure, total, sums)
+        number = _list_members(blocks, border, patches, block, members)
+        _add_points(columns, members, number, False, pure, total, sums)
         count = np.int64(patches.number[block])
         if np.any(PURE_SHARE * pure[:count, 0] < total[:count]):
-            _add_points(blocks, columns, border, patches, block, False, whole, total, sums)
+            _add_points(columns, members, number, True, whole, total, sums)
         for p in range(PER_BLOCK):
             votes = patches.counted[block, p]
             if votes > 0:
