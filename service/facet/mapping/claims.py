@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from facet.mapping.blocks import CENTRE, Blocks, find, pack, unpack
 from facet.mapping.kernel import kernel
+from facet.mapping.runs import dealt
 
 LEFTOVER_REACH = 8  # voxels between a leftover and the box of the patch it joins
 CLAIM_REACH = 2  # voxels between a corner voxel and the box of a patch that claims it too
@@ -306,7 +307,8 @@ def _flat(columns, count):  # type: ignore[no-untyped-def]
 @kernel(parallel=True)
 def _label_all(blocks, observable, patches, which, tolerance, changed):  # type: ignore[no-untyped-def]
     chunks = (which.shape[0] + CHUNK - 1) // CHUNK
-    for chunk in prange(chunks):
+    for turn in prange(chunks):
+        chunk = dealt(turn, chunks)
         stop = min(which.shape[0], (chunk + 1) * CHUNK)
         _label_some(blocks, observable, patches, which, chunk * CHUNK, stop, tolerance, changed)
 

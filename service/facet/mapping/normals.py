@@ -25,6 +25,7 @@ from facet.mapping.blocks import row_at
 from facet.mapping.halo import Halo, gather, make_halos
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory, grow_all
+from facet.mapping.runs import dealt
 from facet.mapping.settings import MapSettings
 from facet.mapping.staleness import find_candidates, find_stale, mark_dirty
 from facet.mapping.store import Dirty, VoxelStore
@@ -150,7 +151,8 @@ def _refresh(  # type: ignore[no-untyped-def]
 
     Every voxel depends on observables alone and writes its own place: threads change nothing. A
     block always falls to the same share: the traces of its voxels lie there."""
-    for share in prange(halos.rows.shape[0]):
+    for turn in prange(halos.rows.shape[0]):
+        share = dealt(turn, halos.rows.shape[0])
         halo = Halo(halos.listed[share], halos.rows[share], halos.first[share], halos.near[share])
         scratch = make_scratch()
         stale = np.zeros(8, np.uint64)

@@ -20,6 +20,7 @@ from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory
 from facet.mapping.normals import VALID, Normals
+from facet.mapping.runs import dealt
 from facet.mapping.settings import STEPS, MapSettings
 from facet.mapping.store import VoxelStore
 from facet.mapping.sums import MOMENTS, SUMS, count_points, read_sums, shift_moments
@@ -231,7 +232,8 @@ def _group_all(  # type: ignore[no-untyped-def]
     blocks, observable, normals, patches, which, grouping, changed, shows
 ):
     size = (which.shape[0] + SHARES - 1) // SHARES  # blocks beside one another share cache lines
-    for share in prange(SHARES):
+    for turn in prange(SHARES):
+        share = dealt(turn, SHARES)
         start, stop = share * size, min(which.shape[0], (share + 1) * size)
         _group_some(
             blocks, observable, normals, patches, which, start, stop, grouping, changed, shows
@@ -328,7 +330,8 @@ def _sum_some(blocks, columns, border, patches, which, start, stop, rungs, histo
 @kernel(parallel=True)
 def _sum_all(blocks, columns, border, patches, which, rungs, histograms):  # type: ignore[no-untyped-def]
     size = (which.shape[0] + SHARES - 1) // SHARES
-    for share in prange(SHARES):
+    for turn in prange(SHARES):
+        share = dealt(turn, SHARES)
         start, stop = share * size, min(which.shape[0], (share + 1) * size)
         _sum_some(blocks, columns, border, patches, which, start, stop, rungs, histograms[share])
 

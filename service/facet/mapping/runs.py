@@ -7,7 +7,17 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from facet.mapping.kernel import kernel
+
 SHARES = 16  # parts that runs are dealt out in; threads take them
+
+
+@kernel(allocates=False)
+def dealt(turn, count):  # type: ignore[no-untyped-def]
+    """Which of `count` parts is done in a turn: every other one first. A thread takes the turns of
+    its half; what lies side by side, and is as dear, goes to both."""
+    half = (count + 1) // 2
+    return 2 * turn if turn < half else 2 * (turn - half) + 1
 
 
 def starts_of(sizes: Any) -> NDArray[np.int64]:
