@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from facet.mapping.mapper import Mapper
+from facet.mapping.rungs import LIMITS
 from facet.mapping.settings import TICKS
 from mapping_logs import cloud, log, mapped, wall
 
@@ -26,8 +27,7 @@ def test_sigma_of_an_empty_map_is_the_lowest_rung() -> None:
 
 
 def test_sigma_stands_on_a_ladder() -> None:
-    field = Mapper()._patches
-    steps = np.sqrt(field.rungs)
+    steps = np.sqrt(LIMITS)
     np.testing.assert_allclose(steps[1:] / steps[:-1], steps[1] / steps[0])
     told = {noisy(s)._patches.sigma() for s in (0.006, 0.00601, 0.00602)}
     assert len(told) == 1

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from facet.mapping import claims, normals, patches, pivot, runs, store, traces
+from facet.mapping import claims, normals, patches, pivot, rungs, runs, store, traces
 from facet.mapping.blocks import pack_all
 from facet.mapping.frozen import freeze, thaw
 from facet.mapping.mapper import Mapper
@@ -28,6 +28,7 @@ SETTINGS = MapSettings(voxel_m=VOXEL_M)
 RARE = (  # limits below which a path is not taken, and what they are set to
     (store, "NOTED", 50),
     (patches, "FEW", 1),
+    (rungs, "FEW", 1),
     (claims, "FEW", 1),
     (pivot, "FEW", 1),
     (normals, "SHARES", 3),

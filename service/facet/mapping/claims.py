@@ -377,25 +377,3 @@ def _label_block(blocks, observable, patches, block, tolerance, scratch):  # typ
             changed = True
     patches.far[block] = far
     return changed
-
-
-@kernel(allocates=False)
-def find_dependents(blocks, far, which, flags, out):  # type: ignore[no-untyped-def]
-    """Blocks whose labels depend on the patches of the blocks `which`: these, those beside them,
-    and those two away that are `far` (B,), with or without a block between. flags (B,) stay false.
-    Lists each once; returns how many."""
-    count = 0
-    for q in range(which.shape[0]):
-        i, j, k = unpack(blocks.keys[which[q]])
-        for n in range(125):
-            di, dj, dk = n % 5 - 2, (n // 5) % 5 - 2, n // 25 - 2
-            other = find(blocks.table_keys, blocks.table_values, pack(i + di, j + dj, k + dk))
-            if other < 0 or flags[other]:
-                continue
-            if max(abs(di), abs(dj), abs(dk)) < 2 or far[other]:
-                flags[other] = True
-                out[count] = other
-                count += 1
-    for q in range(count):
-        flags[out[q]] = False
-    return count

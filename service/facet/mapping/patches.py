@@ -14,24 +14,20 @@ from numba import prange
 from numpy.typing import NDArray
 
 from facet.mapping.bits import trailing_zeros
-from facet.mapping.blocks import CENTRE, row_at
-from facet.mapping.claims import HALF, OFFSET_STEP, find_dependents, label_blocks
-from facet.mapping.eigen import smallest
+from facet.mapping.blocks import row_at
+from facet.mapping.claims import HALF, OFFSET_STEP, label_blocks
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory
 from facet.mapping.normals import VALID, Normals
+from facet.mapping.rungs import FIRST_RUNG, LIMITS, RUNG_STEP, RUNGS, read_rungs
 from facet.mapping.runs import dealt
 from facet.mapping.settings import STEPS, MapSettings
+from facet.mapping.staleness import find_dependents
 from facet.mapping.store import VoxelStore
-from facet.mapping.sums import MOMENTS, SUMS, count_points, read_sums, shift_moments
 
 PER_BLOCK = 12  # patches of a block; what finds no place is a leftover
-RUNGS = 40
-RUNG_STEP = 1.2  # a rung of sigma_N is 20 % wide
-FIRST_RUNG = 0.02 * 1024  # ticks: the lowest rung ends here (1 mm at 5 cm voxels)
 SHARES = 16  # parts that the blocks are dealt out to; threads take them
 FEW = 512  # blocks that are not worth waking other threads for
-PURE_SHARE = 4  # one point in so many must be pure for the rung to be read from these alone
 
 
 class Patches(NamedTuple):
@@ -240,102 +236,6 @@ def _group_all(  # type: ignore[no-untyped-def]
         )
 
 
-@kernel(allocates=False)
-def _list_members(blocks, border, patches, block, members):  # type: ignore[no-untyped-def]
-    """List the voxels that go with a patch of their own block, as members (4, 512): row, place in
-    the block, patch, and whether they are pure: not at a border, and claimed by no plane at an
-    angle. How many. One look-up at a time for all of them: they do not wait for one another."""
-    rows, places, owners, are_pure = members[0], members[1], members[2], members[3]
-    occupied = 0
-    for place in range(64):
-        line = blocks.lines[block, place]
-        if line == 0:
-            continue
-        for x in range(8):
-            rows[occupied] = blocks.rows[line, x] - 1
-            places[occupied] = 8 * place + x
-            occupied += rows[occupied] >= 0
-    count = 0
-    for v in range(occupied):
-        row = rows[v]
-        label = np.int64(patches.label[row])
-        rows[count], places[count], owners[count] = row, places[v], label & 15
-        are_pure[count] = not border[row] and patches.second[row] < 0
-        count += label >> 4 == CENTRE
-    return count
-
-
-@kernel(allocates=False)
-def _add_points(columns, members, count, all_of_them, m, total, sums):  # type: ignore[no-untyped-def]
-    """Sum the members' point moments about the block corner into m (PER_BLOCK, 10): of all, or
-    only of pure ones. Count the points of all members in total (PER_BLOCK,)."""
-    m[:] = 0
-    total[:] = 0
-    for v in range(count):
-        row, place, p = members[0, v], members[1, v], members[2, v]
-        if all_of_them or members[3, v]:
-            read_sums(columns, row, sums)
-            shift_moments(sums, place & 7, (place >> 3) & 7, place >> 6, m[p])
-            total[p] += sums[0]
-        else:
-            total[p] += count_points(columns, row)
-
-
-@kernel(allocates=False)
-def _variance(m, spread):  # type: ignore[no-untyped-def]
-    """Smallest principal variance of point moments; spread (6,): room."""
-    n = float(m[0])
-    s = 0
-    for a in range(3):
-        for b in range(a, 3):
-            spread[s] = m[4 + s] / n - (m[1 + a] / n) * (m[1 + b] / n)
-            s += 1
-    return smallest(spread)[0]
-
-
-@kernel
-def _sum_some(blocks, columns, border, patches, which, start, stop, rungs, histogram):  # type: ignore[no-untyped-def]
-    """Point moments and the rung of sigma_N. Corner voxels hold points of two planes: they are
-    left out where enough others are there."""
-    pure = np.empty((PER_BLOCK, MOMENTS), np.int64)
-    whole = np.empty((PER_BLOCK, MOMENTS), np.int64)
-    total = np.empty(PER_BLOCK, np.int64)
-    sums, spread = np.empty(SUMS, np.int64), np.empty(6)
-    members = np.empty((4, 512 + 16), np.int64)  # 16: columns start on different cache sets
-    for q in range(start, stop):
-        block = which[q]
-        number = _list_members(blocks, border, patches, block, members)
-        _add_points(columns, members, number, False, pure, total, sums)
-        count = np.int64(patches.number[block])
-        if np.any(PURE_SHARE * pure[:count, 0] < total[:count]):
-            _add_points(columns, members, number, True, whole, total, sums)
-        for p in range(PER_BLOCK):
-            votes = patches.counted[block, p]
-            if votes > 0:
-                histogram[patches.rung[block, p]] -= votes
-            patches.counted[block, p] = 0
-            if p >= count:
-                continue
-            variance = _variance(
-                pure[p] if PURE_SHARE * pure[p, 0] >= total[p] else whole[p], spread
-            )
-            rung = 0
-            while rung < RUNGS - 1 and variance > rungs[rung]:
-                rung += 1
-            patches.rung[block, p] = rung
-            patches.counted[block, p] = patches.votes[block, p]
-            histogram[rung] += patches.votes[block, p]
-
-
-@kernel(parallel=True)
-def _sum_all(blocks, columns, border, patches, which, rungs, histograms):  # type: ignore[no-untyped-def]
-    size = (which.shape[0] + SHARES - 1) // SHARES
-    for turn in prange(SHARES):
-        share = dealt(turn, SHARES)
-        start, stop = share * size, min(which.shape[0], (share + 1) * size)
-        _sum_some(blocks, columns, border, patches, which, start, stop, rungs, histograms[share])
-
-
 class PatchField:
     """Patches of all blocks, kept true by grouping dirty blocks again."""
 
@@ -349,7 +249,6 @@ class PatchField:
         )
         self.patches = empty_patches()
         self.histogram = np.zeros(RUNGS, np.int64)  # voxels by the rung of their patch
-        self.rungs = (FIRST_RUNG * RUNG_STEP ** np.arange(RUNGS)) ** 2  # upper limits, ticks^2
         self._flags = np.zeros(0, np.bool_)
 
     def update(
@@ -379,18 +278,10 @@ class PatchField:
         )  # fmt: skip
         relabelled_blocks = near[relabelled]
         touched = np.union1d(block_of[touched_rows], np.union1d(dirty, relabelled_blocks))
-        self._sum(store, normals, touched)
+        read_rungs(
+            store.blocks, store.columns, normals.border, self.patches, touched, self.histogram
+        )
         return dirty[changed], relabelled_blocks
-
-    def _sum(self, store: VoxelStore, normals: Normals, which: NDArray[np.int32]) -> None:
-        """Point moments and rungs of the blocks `which`, and what they change of the histogram."""
-        sources = store.blocks, store.columns, normals.border, self.patches
-        if len(which) < FEW:
-            _sum_some(*sources, which, 0, len(which), self.rungs, self.histogram)
-        else:
-            histograms = np.zeros((SHARES, RUNGS), np.int64)
-            _sum_all(*sources, which, self.rungs, histograms)
-            self.histogram += histograms.sum(axis=0)
 
     def _around(self, store: VoxelStore, blocks: NDArray[np.int32]) -> NDArray[np.int32]:
         """Blocks whose labels depend on the patches of `blocks`."""
@@ -403,7 +294,7 @@ class PatchField:
         if total == 0:
             return FIRST_RUNG
         rung = int(np.searchsorted(np.cumsum(self.histogram), (total + 1) // 2))
-        return float(np.sqrt(self.rungs[rung] / RUNG_STEP))
+        return float(np.sqrt(LIMITS[rung] / RUNG_STEP))
 
     def _fit(self, store: VoxelStore) -> None:
         blocks, rows = len(store.blocks.keys), len(store.columns.block)
