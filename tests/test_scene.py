@@ -6,12 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.Point3_pb2 import Point3
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 
 from examples import EXAMPLES, SCAN_KEY, STAMP_NS
 from facet_protocol import Envelope, MapUpdate, TilePoints, decode_scan
+from facet_protocol.messages import PlaneFrame
 from facet_protocol.scene import encode_scene, encode_tiles_cloud
 
 UPDATE = EXAMPLES["facet.v1.MapUpdate"]
@@ -31,6 +33,22 @@ def test_outlines_are_loops_on_their_plane() -> None:
     vertices = np.array([[p.x, p.y, p.z] for line in entity.lines for p in line.points])
     np.testing.assert_allclose(vertices @ plane.normal, plane.d, atol=1e-9)
     assert entity.frame_id == "map"
+
+
+def test_its_bytes_are_those_of_points_made_one_by_one() -> None:
+    """They are written as bytes; a coordinate that is 0 is left out on the wire."""
+    x, y, z = np.eye(3)
+    flat = replace(UPDATE.changed[0], normal=z, d=0.0, frame=PlaneFrame(x, y, z, 0.00625))
+    for plane in (*UPDATE.changed, flat):
+        payload = encode_scene(replace(UPDATE, changed=(plane,)), "map")[1]
+        scene = SceneUpdate.FromString(payload)
+        rings = [r for s in plane.surfaces for r in (s.outer, *(h.ring for h in s.holes))]
+        for line, ring in zip(scene.entities[0].lines, rings, strict=True):
+            told = [(p.x, p.y, p.z) for p in line.points]
+            assert told == [tuple(p) for p in plane.lift(ring).tolist()]
+            del line.points[:]
+            line.points.extend(Point3(x=x, y=y, z=z) for x, y, z in told)
+        assert scene.SerializeToString(deterministic=True) == payload
 
 
 def test_what_is_retired_is_deleted_and_a_snapshot_clears() -> None:

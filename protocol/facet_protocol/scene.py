@@ -9,7 +9,6 @@ from foxglove_schemas_protobuf.Color_pb2 import Color
 from foxglove_schemas_protobuf.KeyValuePair_pb2 import KeyValuePair
 from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
 from foxglove_schemas_protobuf.PackedElementField_pb2 import PackedElementField
-from foxglove_schemas_protobuf.Point3_pb2 import Point3
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 from foxglove_schemas_protobuf.SceneEntity_pb2 import SceneEntity
 from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletion
@@ -34,19 +33,39 @@ HOLE_COLOURS: dict[HoleKind, RGBA] = {
     HoleKind.OPENING: (0.20, 0.70, 0.90, 1.0),
     HoleKind.UNOBSERVED: (0.50, 0.50, 0.50, 1.0),
 }
+_POINTS = LinePrimitive.DESCRIPTOR.fields_by_name["points"].number
+_POINT_SIZE = 27  # bytes of a Point3: x, y, z, each a tag and a float64
+_POINT = np.dtype(
+    [
+        ("field", "u1"), ("size", "u1"),
+        ("x_field", "u1"), ("x", "<f8"), ("y_field", "u1"), ("y", "<f8"),
+        ("z_field", "u1"), ("z", "<f8"),
+    ]
+)  # fmt: skip
 _IDENTITY = pose_message(Pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])))
+
+
+def _points_field(xyz: NDArray[np.float64]) -> bytes:
+    """The points (N, 3) of a LinePrimitive as they are on the wire: a scene has ten thousand, and
+    to make as many messages one by one takes ten times as long as to read them from here."""
+    rows = np.empty(len(xyz), _POINT)
+    rows["field"], rows["size"] = _POINTS << 3 | 2, _POINT_SIZE  # 2: length-delimited
+    for number, axis in enumerate("xyz", start=1):
+        rows[f"{axis}_field"], rows[axis] = number << 3 | 1, xyz[:, number - 1]  # 1: 64 bits
+    return rows.tobytes()
 
 
 def _loop(plane: Plane, ring: NDArray[np.int32], rgba: RGBA) -> LinePrimitive:
     r, g, b, a = rgba
-    return LinePrimitive(
+    line = LinePrimitive(
         type=LinePrimitive.LINE_LOOP,
         pose=_IDENTITY,
         thickness=OUTLINE_PX,
         scale_invariant=True,
-        points=[Point3(x=x, y=y, z=z) for x, y, z in plane.lift(ring).tolist()],
         color=Color(r=r, g=g, b=b, a=a),
     )
+    line.MergeFromString(_points_field(plane.lift(ring)))
+    return line
 
 
 def _entity(plane: Plane, stamp_ns: int, frame_id: str) -> SceneEntity:
