@@ -255,7 +255,7 @@ class PublishSection(Section):
     status_s: float = Field(default=1.0, gt=0.0, le=60.0, description="between two words of it")
     points: bool = Field(default=True, description="whether points are published too")
     points_s: float = Field(
-        default=0.5, gt=0.0, le=60.0, description="changed points, at most this often"
+        default=1.0, gt=0.0, le=60.0, description="changed points, at most this often"
     )
     queue: int = Field(
         default=64, ge=1, le=4096, description="updates that may wait; full, the oldest goes"

@@ -26,6 +26,7 @@ from facet_protocol.messages import (
 )
 
 Tile = tuple[int, int, int]
+BEATS = 16  # in a period, to one of which the points of a tile are sent
 RECORD_TOPICS = {
     ResolvedPose: topics.RESOLVED_TOPIC,
     Corrected: topics.CORRECTED_TOPIC,
@@ -64,7 +65,7 @@ class Pipeline:
         self._applied: dict[str, Applied] = {}
         self._replaced: list[Conflict] = []  # since the last update
         self._changed_tiles: set[Tile] = set()
-        self._points_sent_ns = 0
+        self._points_asked_ns = 0
         self.revision = 0
         self.log_time_ns = 0  # of the newest message applied
         self.is_stale = False  # something was inserted since the last update
@@ -207,12 +208,24 @@ class Pipeline:
         return cuts or [Cut(update.revision, "", "", 0, 0, 0, 0)]  # of corrections alone
 
     def _send_points(self, update: MapUpdate | None) -> None:
-        due = self.log_time_ns - self._points_sent_ns >= self._points_every_ns
-        if not self._points_every_ns or not self._changed_tiles or (update and not due):
+        """The points of the changed tiles whose beat fell since the last update; at the end, of
+        all. Each has a beat of its own, or one update would have to send them all."""
+        if not self._points_every_ns:
             return
-        self._points_sent_ns = self.log_time_ns
-        tiles, self._changed_tiles = sorted(self._changed_tiles), set()
-        self._emit(self._outgoing.points(self._mapper.points(tiles), self.log_time_ns))
+        before, now = self._points_asked_ns, self.log_time_ns
+        self._points_asked_ns = now
+        tiles = sorted(t for t in self._changed_tiles if not update or self._beats(t, before, now))
+        if tiles:
+            self._changed_tiles.difference_update(tiles)
+            self._emit(self._outgoing.points(self._mapper.points(tiles), self.log_time_ns))
+
+    def _beats(self, tile: Tile, before_ns: int, now_ns: int) -> bool:
+        """Whether the points of a tile are due: once in a period, at a time that differs from tile
+        to tile."""
+        x, y, z = tile
+        every = self._points_every_ns
+        beat = (7 * x + 11 * y + 13 * z) % BEATS * every // BEATS
+        return (now_ns + beat) // every > (before_ns + beat) // every
 
     def _emit(self, messages: Iterable[tuple[Envelope, Message | None]]) -> None:
         if not self._sinks:  # nothing is encoded for nobody
