@@ -246,7 +246,7 @@ class Service:
             self.account.gauge("planes_changed", len(update.changed))
             self.account.gauge("update_ms", took_s * 1e3)
             self.account.gauge("map_lag_s", (time.time_ns() - self._pipeline.log_time_ns) * 1e-9)
-            self.account.gauge("voxels", self._mapper.counts().voxels)
+            self.account.gauge("voxels", self._mapper.num_voxels)
         if self._position is not None and self._pipeline.is_settled and self._keeper.is_due():
             self._keeper.start(self._hold(self._position))
 

@@ -115,6 +115,7 @@ def check_observables(store: VoxelStore) -> None:
     where = c.block[on], (local >> np.uint64(6)).astype(np.int64)
     np.bitwise_or.at(bits, where, np.uint64(1) << (local & np.uint64(63)))
     assert np.array_equal(bits, store.blocks.occupied), "an occupied bit is wrong"
+    assert store.num_voxels == len(on), "voxels were miscounted"
 
 
 def _check_normals(mapper: Mapper) -> None:

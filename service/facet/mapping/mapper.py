@@ -208,8 +208,13 @@ class Mapper:
             self._store, self._patches.patches, self._tiles, keys, self.settings.voxel_m
         )
 
+    @property
+    def num_voxels(self) -> int:
+        """Occupied voxels, as of the last update."""
+        return self._store.num_voxels
+
     def counts(self) -> MapCounts:
-        """What was counted, and what the voxels are, as of the last update."""
+        """What was counted, and what the voxels are, as of the last update: it looks at all."""
         return self._census.take(
             self._store, self._normals.normals, self._tiles, self._patches.sigma()
             / TICKS * self.settings.voxel_m,

@@ -258,6 +258,7 @@ class VoxelStore:
         self.num_blocks = 0
         self.num_lines = 1  # line 0 is that of no voxels
         self.num_rows = 0
+        self.num_voxels = 0  # occupied, as last settled
         self._grow_blocks(blocks)
         self._grow_lines(rows)
         self.columns = grow_all(self._memory, self.columns, 0, rows)
@@ -301,6 +302,7 @@ class VoxelStore:
         self._grow_lines(rows + 4096)
         self.num_blocks, self.num_rows = _add_blocks(self.blocks, block_keys), rows
         self.num_lines = _place(self.blocks, self.columns, rows)
+        self.num_voxels = int(np.count_nonzero(columns["observable"]))
 
     def insert(self, ticks: Ticks) -> None:
         """Add a scan's points."""
@@ -328,7 +330,10 @@ class VoxelStore:
         dirty = Dirty(np.empty(size, np.int32), np.empty(size, np.int64))
         count = _settle(self.blocks, self.columns, self._touched_rows, size, *dirty)
         self._num_touched = 0
-        return Dirty(dirty.rows[:count], dirty.before[:count])
+        dirty = Dirty(dirty.rows[:count], dirty.before[:count])
+        new, gone = dirty.before == 0, self.columns.observable[dirty.rows] == 0
+        self.num_voxels += int(np.count_nonzero(new)) - int(np.count_nonzero(gone))
+        return dirty
 
     def voxel_keys(self, rows: NDArray[np.int32]) -> NDArray[np.int64]:
         """(V, 3) voxel indices of rows (V,)."""
