@@ -12,6 +12,8 @@ from facet.mapping.blocks import (
     OFFSET,
     find,
     hash_key,
+    list_rows,
+    list_voxels,
     pack,
     pack_all,
     put,
@@ -109,3 +111,19 @@ def test_links_stay_true_while_the_store_grows() -> None:
     store = store_of(rng.integers(-300, 300, (20_000, 3)))
     assert store.num_blocks > 4096
     check_blocks(store)
+
+
+def test_the_voxels_of_a_block_are_listed_by_their_places() -> None:
+    rng = np.random.default_rng(2)
+    store = store_of(rng.integers(-12, 12, (3000, 3)))
+    blocks, c = store.blocks, store.columns
+    rows, places = np.empty(512, np.int64), np.empty(512, np.int64)
+    for block in range(store.num_blocks):
+        own = np.flatnonzero(c.block[: store.num_rows] == block)
+        expected = sorted(zip(c.local[own].tolist(), own.tolist(), strict=True))
+        count = list_rows(blocks, block, rows, places)
+        assert list(zip(places[:count].tolist(), rows[:count].tolist(), strict=True)) == expected
+        bits = rng.integers(0, 1 << 63, 8).astype(np.uint64) & blocks.occupied[block]
+        marked = [(p, r) for p, r in expected if (int(bits[p >> 6]) >> (p & 63)) & 1]
+        count = list_voxels(blocks, block, bits, rows, places)
+        assert list(zip(places[:count].tolist(), rows[:count].tolist(), strict=True)) == marked

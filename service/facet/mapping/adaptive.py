@@ -14,9 +14,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from facet.mapping.eigen import eigenvalues, eigenvector
 from facet.mapping.kernel import kernel
-from facet.mapping.region import covariance, is_one_pose, shape
+from facet.mapping.principal import LAMBDA, NX, NY, NZ, TAN_GAMMA
+from facet.mapping.region import is_one_pose
 from facet.mapping.settings import STEPS, MapSettings
 from facet.mapping.traces import (
     COUNT,
@@ -101,13 +101,11 @@ def make_rule(settings: MapSettings) -> Rule:
 
 
 @kernel(allocates=False)
-def _step(sums, r, rule):  # type: ignore[no-untyped-def]
+def _step(number, ratio, r, rule):  # type: ignore[no-untyped-def]
     """The next radius by eq. 16-20: at least one voxel up or down, at most double or half."""
-    votes = min(sums[0], rule.growth.shape[0] - 1)
-    growth = rule.growth[votes]
-    ratio = 1e-3
-    if sums[0] >= 4:
-        ratio, _ = shape(eigenvalues(*covariance(sums)), rule.floor2)
+    growth = rule.growth[min(number, rule.growth.shape[0] - 1)]
+    if number < MIN_VOTES:
+        ratio = 1e-3
     factor = 1.0 + rule.sigma_target / ratio - rule.w_sigma + rule.w_points * (growth - 1.0)
     factor = min(2.0, max(0.5, factor))
     r_next = np.int64(np.floor(r * factor + 0.5))
@@ -118,24 +116,27 @@ def _step(sums, r, rule):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=False)
 def _find_radius(at, rule, scratch):  # type: ignore[no-untyped-def]
-    """Follow the radius until it repeats; of a cycle the smallest. (radius, reach): reach is the
-    largest radius that was looked at; radius 0 where it would leave the halo."""
-    sums, state = scratch[2], scratch[4]
+    """Follow the radius until it repeats; of a cycle the smallest. (place of the sums, -1 where
+    it would leave the halo; radius; reach: the largest radius that was looked at)."""
+    kept, principal, state = scratch[2], scratch[3], scratch[4]
     r = rule.start
     reach = r
     visited = np.int64(0)
-    while ask(at, r, reach, scratch):
+    e = ask(at, r, reach, scratch)
+    while e >= 0:
         visited |= np.int64(1) << r
-        r_next = _step(sums, r, rule)
+        r_next = _step(np.int64(kept[e, 0]), principal[LAMBDA + e], r, rule)
         if r_next == r or (visited >> r_next) & 1:
-            if r_next < r and not ask(at, r_next, reach, scratch):
-                break
-            return min(r, r_next), reach
+            if r_next < r:
+                r = r_next
+                e = ask(at, r, reach, scratch)
+            break
         r = r_next
         reach = max(r, reach)
         if reach > FARTHEST:
             state[KNOWN] = 0
-    return 0, reach
+        e = ask(at, r, reach, scratch)
+    return e, r, reach
 
 
 @kernel(allocates=False)
@@ -145,53 +146,25 @@ def estimate(at, scratch):  # type: ignore[no-untyped-def]
 
     at: halo, its margin, the voxel's place in the block, its observable, rule."""
     _, _, _, seen, rule = at
-    lists, votes, sums, _, state, _ = scratch
+    lists, votes, kept, state = scratch[0], scratch[1], scratch[2], scratch[4]
     if seen == 0:
         return EMPTY, 0, 0, 0, 0, False, 0
-    r, reach = _find_radius(at, rule, scratch)
+    whole, r, reach = _find_radius(at, rule, scratch)
     one_line = seen >> 32 != 0
-    if r == 0 or (one_line and not list_votes(at, reach, scratch)):
+    if whole < 0 or (one_line and not list_votes(at, reach, scratch)):
         return WIDER, 0, 0, 0, 0, False, 0
-    if sums[0] < rule.sparse:
+    if kept[whole, 0] < rule.sparse:
         return SPARSE, 0, 0, 0, 0, False, reach
     one_pose = one_line and is_one_pose(lists, votes, state[COUNT], r)
-    kind, nx, ny, nz, tan_gamma = _classify(sums, seen, one_pose, rule)
-    every, whole = sums[0], tan_gamma  # of all that the region holds
-    outlier = rule.outlier * ((seen >> 12) & 15) * sums[0] <= sums[1]  # of few points, among many
-    beside = kind == THICK and tan_gamma <= rule.tan_theta  # a plane, not on it: a noise shell
-    if kind != ALIGNED and (outlier or beside):
-        return THICK, 0, 0, 0, 255, False, reach
     region = at, r, reach, one_pose
-    first = r  # radius of the region of the first normal: smaller where the full one is thick
-    while kind != ALIGNED:
-        passes = 1 if kind == VALID else rule.passes
-        kind, nx, ny, nz, tan_gamma = _look_again(
-            region, nx, ny, nz, SLAB, passes, rule.sparse, scratch
+    kind, nx, ny, nz, tan_gamma = _classify(whole, seen, one_pose, rule, scratch)
+    e = whole
+    if kind != ALIGNED:
+        kind, nx, ny, nz, tan_gamma, e = _look_closer(
+            region, kind, nx, ny, nz, tan_gamma, whole, scratch
         )
-        if kind == WIDER:
-            return WIDER, 0, 0, 0, 0, False, 0
-        if kind == SPARSE:
-            return SPARSE, 0, 0, 0, 0, False, reach
-        first -= 1
-        if kind == VALID or first < max(1, r - rule.shrink):
-            break
-        if not ask(at, first, reach, scratch):
-            return WIDER, 0, 0, 0, 0, False, 0
-        if sums[0] < rule.least_first:
-            break
-        _, nx, ny, nz, _ = _classify(sums, seen, one_pose, rule)
-        kind = THICK
-    dense = sums[1] >= rule.thin_points * sums[0]  # centroids are sure enough for a thinner slab
-    nearly = kind == THICK and tan_gamma < rule.tan_mixed < whole
-    if nearly and dense and r > 1:  # a step: a narrow face between two
-        least = (every + rule.thin_share - 1) // rule.thin_share
-        kind, nx, ny, nz, tan_gamma = _look_again(
-            region, nx, ny, nz, THIN_SLAB, rule.thin_passes, least, scratch
-        )
-        if kind == WIDER:
-            return WIDER, 0, 0, 0, 0, False, 0
-        if kind == SPARSE:  # a slice of a lump
-            return THICK, 0, 0, 0, 255, False, reach
+    if e < 0:
+        return kind, 0, 0, 0, 255 if kind == THICK else 0, False, reach
     if kind == VALID and (seen >> 31) & 1 == 1 and _towards(seen, nx, ny, nz) < 4.0:
         kind = MIXED  # both sides of a thin thing, not one side from two directions
     half_degrees = np.int64(np.floor(np.arctan(tan_gamma) * 114.59155902616465 + 0.5))
@@ -201,30 +174,74 @@ def estimate(at, scratch):  # type: ignore[no-untyped-def]
         np.int64(np.floor(ny * UNIT + 0.5)),
         np.int64(np.floor(nz * UNIT + 0.5)),
         half_degrees,
-        _at_border(sums, seen, r, nx, ny, nz, rule),
+        _at_border(kept[e], seen, r, nx, ny, nz, rule),
         reach,
     )
 
 
 @kernel(allocates=False)
+def _look_closer(region, kind, nx, ny, nz, tan_gamma, whole, scratch):  # type: ignore[no-untyped-def]
+    """Class and normal by the votes in the voxel's own slab: across the normal of the whole region,
+    where that is thick of a smaller one, and where two surfaces meet in a thinner slab.
+
+    Returns (class, normal, tan gamma, place of the sums that they are of, -1: there is none)."""
+    at, r, reach, one_pose = region
+    _, _, _, seen, rule = at
+    kept = scratch[2]
+    number, of_whole = np.int64(kept[whole, 0]), tan_gamma  # of all that the region holds
+    outlier = rule.outlier * ((seen >> 12) & 15) * number <= kept[whole, 1]  # few among many
+    beside = kind == THICK and tan_gamma <= rule.tan_theta  # a plane, not on it: a noise shell
+    if outlier or beside:
+        return THICK, 0.0, 0.0, 0.0, 0.0, -1
+    first = r  # radius of the region of the first normal: smaller where the full one is thick
+    while True:
+        passes = 1 if kind == VALID else rule.passes
+        kind, nx, ny, nz, tan_gamma, e = _look_again(
+            region, nx, ny, nz, SLAB, passes, rule.sparse, scratch
+        )
+        first -= 1
+        if e < 0 or kind == VALID or first < max(1, r - rule.shrink):
+            break
+        e = ask(at, first, reach, scratch)
+        if e < 0:
+            kind = WIDER
+        if e < 0 or kept[e, 0] < rule.least_first:
+            break
+        _, nx, ny, nz, _ = _classify(e, seen, one_pose, rule, scratch)
+        kind = THICK
+    nearly = kind == THICK and tan_gamma < rule.tan_mixed < of_whole
+    dense = e >= 0 and kept[e, 1] >= rule.thin_points * kept[e, 0]  # sure enough for a thinner slab
+    if nearly and dense and r > 1:  # a step: a narrow face between two
+        least = (number + rule.thin_share - 1) // rule.thin_share
+        kind, nx, ny, nz, tan_gamma, e = _look_again(
+            region, nx, ny, nz, THIN_SLAB, rule.thin_passes, least, scratch
+        )
+        if kind == SPARSE:  # a slice of a lump
+            kind = THICK
+    return kind, nx, ny, nz, tan_gamma, e
+
+
+@kernel(allocates=False)
 def _look_again(region, nx, ny, nz, slab, passes, least, scratch):  # type: ignore[no-untyped-def]
     """Class and normal again, and again: of the votes on the voxel's own side, by the last normal,
-    and in its own slab; SPARSE where these are fewer than `least`."""
+    and in its own slab. Returns what `_look_closer` does; SPARSE where these are fewer than
+    `least`."""
     at, r, reach, one_pose = region
-    seen, rule, sums = at[3], at[4], scratch[2]
-    kind, tan_gamma = SPARSE, 0.0
+    seen, rule, kept = at[3], at[4], scratch[2]
+    kind, tan_gamma, e = SPARSE, 0.0, -1
     last = np.int64(-1)
     for _ in range(passes):
         key = slab_key(r, slab, nx, ny, nz)
         if key == last:  # and so on for ever
             break
         last = key
-        if not ask(at, key, reach, scratch):
-            return WIDER, nx, ny, nz, 0.0
-        if sums[0] < least:
-            return SPARSE, nx, ny, nz, 0.0
-        kind, nx, ny, nz, tan_gamma = _classify(sums, seen, one_pose, rule)
-    return kind, nx, ny, nz, tan_gamma
+        e = ask(at, key, reach, scratch)
+        if e < 0:
+            return WIDER, nx, ny, nz, 0.0, -1
+        if kept[e, 0] < least:
+            return SPARSE, nx, ny, nz, 0.0, -1
+        kind, nx, ny, nz, tan_gamma = _classify(e, seen, one_pose, rule, scratch)
+    return kind, nx, ny, nz, tan_gamma, e
 
 
 @kernel(allocates=False)
@@ -249,15 +266,15 @@ def _towards(seen, nx, ny, nz):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _classify(sums, seen, one_pose, rule):  # type: ignore[no-untyped-def]
-    """(class, normal towards the view, tan gamma) of the voxel with observable `seen`."""
-    a, b, c, d, e, f = covariance(sums)
-    variances = eigenvalues(a, b, c, d, e, f)
-    ratio, tan_gamma = shape(variances, rule.floor2)
-    nx, ny, nz = eigenvector(a, b, c, d, e, f, variances[2])
+def _classify(e, seen, one_pose, rule, scratch):  # type: ignore[no-untyped-def]
+    """(class, normal towards the view, tan gamma) of the voxel with observable `seen`, by the sums
+    at a place."""
+    sums, principal = scratch[2][e], scratch[3]
+    nx, ny, nz = principal[NX + e], principal[NY + e], principal[NZ + e]
+    tan_gamma = principal[TAN_GAMMA + e]
     if _towards(seen, nx, ny, nz) < 0.0:
         nx, ny, nz = -nx, -ny, -nz
-    if ratio < rule.epsilon or one_pose:
+    if principal[LAMBDA + e] < rule.epsilon or one_pose:
         return ALIGNED, nx, ny, nz, tan_gamma
     one = 1.0 / sums[1]  # the voxel itself must lie on the plane of its region: no noise shells
     own = (

@@ -7,6 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from facet.mapping.bits import trailing_zeros
 from facet.mapping.kernel import kernel
 
 Int64Array = NDArray[np.int64]
@@ -103,6 +104,39 @@ class Blocks(NamedTuple):
 def row_at(blocks: Blocks, block: int, local: int) -> Any:
     """The row of a voxel at local index x + 8 y + 64 z of a block, or -1."""
     return blocks.rows[blocks.lines[block, local >> 3], local & 7] - 1
+
+
+@kernel(allocates=False)
+def list_voxels(blocks, block, bits, rows, places):  # type: ignore[no-untyped-def]
+    """List the voxels of a block whose bits are set in bits (8,), as rows and places x + 8 y + 64 z
+    in the block. How many. One look-up at a time for all of them: they do not wait for one
+    another."""
+    count = 0
+    for z in range(8):
+        word = bits[z]
+        while word != np.uint64(0):
+            places[count] = 64 * z + np.int64(trailing_zeros(word))
+            word &= word - np.uint64(1)
+            count += 1
+    for v in range(count):
+        place = places[v]
+        rows[v] = blocks.rows[blocks.lines[block, place >> 3], place & 7] - 1
+    return count
+
+
+@kernel(allocates=False)
+def list_rows(blocks, block, rows, places):  # type: ignore[no-untyped-def]
+    """List likewise all voxels that a block has a row for, even where they are empty now."""
+    count = 0
+    for y in range(64):
+        line = blocks.lines[block, y]
+        if line == 0:
+            continue
+        for x in range(8):
+            rows[count] = blocks.rows[line, x] - 1
+            places[count] = 8 * y + x
+            count += rows[count] >= 0
+    return count
 
 
 @kernel(allocates=False)

@@ -7,30 +7,30 @@ import numpy as np
 from facet.mapping.kernel import kernel
 
 
-@kernel(allocates=False)
+@kernel(allocates=False, inlined=True)
 def eigenvalues(a, b, c, d, e, f):  # type: ignore[no-untyped-def]
     """Eigenvalues, descending, of [[a, d, e], [d, b, f], [e, f, c]] (Smith 1961, closed form).
 
     The root furthest from the others is simple, so Newton's method finds it to the last bit; the
-    other two solve the quadratic that is left. No libm: the same bits on every machine."""
+    other two solve the quadratic that is left. No libm: the same bits on every machine. No
+    branches: a loop over several matrices takes them side by side."""
     q = (a + b + c) / 3.0
     aa, bb, cc = a - q, b - q, c - q
     p2 = (aa * aa + bb * bb + cc * cc + 2.0 * (d * d + e * e + f * f)) / 6.0
-    if p2 <= 1e-300:
-        return q, q, q
     p = np.sqrt(p2)
     half = 0.5 * (aa * (bb * cc - f * f) - d * (d * cc - f * e) + e * (d * f - bb * e)) / (p2 * p)
     h = min(1.0, abs(half))
     t = 0.866058 + h * (0.165476 + h * (h * 0.009570 - 0.041071))  # cos(acos(h) / 3) to 3e-5
-    for _ in range(2):
-        t -= ((4.0 * t * t - 3.0) * t - h) / (12.0 * t * t - 3.0)
+    t -= ((4.0 * t * t - 3.0) * t - h) / (12.0 * t * t - 3.0)
+    t -= ((4.0 * t * t - 3.0) * t - h) / (12.0 * t * t - 3.0)
     spread = 1.7320508075688772 * np.sqrt(max(0.0, 1.0 - t * t))
-    if half > 0.0:
-        return q + 2.0 * p * t, q + p * (spread - t), q - p * (spread + t)
-    return q + p * (t + spread), q + p * (t - spread), q - 2.0 * p * t
+    far, one, other = 2.0 * p * t, p * (t + spread), p * (t - spread)
+    high, middle, low = (far, -other, -one) if half > 0.0 else (one, other, -far)
+    same = p2 <= 1e-300
+    return q if same else q + high, q if same else q + middle, q if same else q + low
 
 
-@kernel(allocates=False)
+@kernel(allocates=False, inlined=True)
 def eigenvector(a, b, c, d, e, f, value):  # type: ignore[no-untyped-def]
     """Unit eigenvector of that matrix for a simple eigenvalue; (0, 0, 1) where none is clear."""
     x0, y0, z0 = a - value, d, e
@@ -39,19 +39,21 @@ def eigenvector(a, b, c, d, e, f, value):  # type: ignore[no-untyped-def]
     ux, uy, uz = y0 * z1 - z0 * y1, z0 * x1 - x0 * z1, x0 * y1 - y0 * x1
     vx, vy, vz = y0 * z2 - z0 * y2, z0 * x2 - x0 * z2, x0 * y2 - y0 * x2
     wx, wy, wz = y1 * z2 - z1 * y2, z1 * x2 - x1 * z2, x1 * y2 - y1 * x2
-    uu, vv, ww = (
-        ux * ux + uy * uy + uz * uz,
-        vx * vx + vy * vy + vz * vz,
-        wx * wx + wy * wy + wz * wz,
+    uu = ux * ux + uy * uy + uz * uz
+    vv = vx * vx + vy * vy + vz * vz
+    ww = wx * wx + wy * wy + wz * wz
+    second = (vv > uu) & (vv >= ww)
+    third = (ww > uu) & (not second)
+    ux, uy, uz = vx if second else ux, vy if second else uy, vz if second else uz
+    ux, uy, uz = wx if third else ux, wy if third else uy, wz if third else uz
+    longest = vv if second else ww if third else uu
+    length = np.sqrt(longest)
+    none = longest <= 1e-280
+    return (
+        0.0 if none else ux / length,
+        0.0 if none else uy / length,
+        1.0 if none else uz / length,
     )
-    if vv > uu and vv >= ww:
-        ux, uy, uz, uu = vx, vy, vz, vv
-    elif ww > uu:
-        ux, uy, uz, uu = wx, wy, wz, ww
-    if uu <= 1e-280:
-        return 0.0, 0.0, 1.0
-    length = np.sqrt(uu)
-    return ux / length, uy / length, uz / length
 
 
 @kernel(allocates=False)

@@ -111,11 +111,13 @@ def gather(blocks, observable, block, margin, halo):  # type: ignore[no-untyped-
             if x >> 3 != cell:  # into the next block
                 cell = x >> 3
                 voxels = blocks.rows[blocks.lines[halo.near[start + cell + blocks_out], inside]]
-            seen = observable[voxels[x & 7] - 1]
-            words[count] = seen
-            poses[count] = seen >> 32
+            words[count] = voxels[x & 7] - 1
             places[count] = place | bit
             count += 1
+    for i in range(count):  # one look-up at a time for all: they do not wait for one another
+        seen = observable[words[i]]
+        words[i] = seen
+        poses[i] = seen >> 32
 
 
 @kernel(allocates=False)

@@ -29,17 +29,27 @@ _WRITABLE = _writable()
 
 
 def kernel(
-    function: Callable[..., Any] | None = None, *, parallel: bool = False, allocates: bool = True
+    function: Callable[..., Any] | None = None,
+    *,
+    parallel: bool = False,
+    allocates: bool = True,
+    inlined: bool = False,
 ) -> Any:
-    """Compile a loop: without the interpreter's lock, cached, on all cores if `parallel`.
+    """Compile a loop: without the interpreter's lock, cached, on all cores if `parallel`. What is
+    divided by zero is infinite or no number, as in arrays.
+
+    One that is `inlined` is always compiled into those that call it: loops with no other calls in
+    them can take several turns at once.
 
     One that makes no array (allocates=False) borrows those it is given. Else it counts references
     to each of them, an atomic operation at every call and every look into a tuple: half of the time
     of small loops, and more where two threads count at the same arrays. (The option is numba's own
     name for it; one that does make an array is then refused by the compiler.)"""
     if function is None:
-        return lambda own: kernel(own, parallel=parallel, allocates=allocates)
-    options: Any = {} if allocates else {"_nrt": False}
+        return lambda own: kernel(own, parallel=parallel, allocates=allocates, inlined=inlined)
+    options: Any = {"error_model": "numpy", "forceinline": inlined}
+    if not allocates:
+        options["_nrt"] = False
     config: Any = numba.config
     before = config.CACHE_DIR
     if _WRITABLE:

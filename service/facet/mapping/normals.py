@@ -20,19 +20,20 @@ from facet.mapping.adaptive import (
     estimate,
     make_rule,
 )
-from facet.mapping.bits import trailing_zeros
-from facet.mapping.blocks import row_at
+from facet.mapping.blocks import list_voxels
 from facet.mapping.halo import Halo, gather, make_halos
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory, grow_all
+from facet.mapping.principal import analyse_all
 from facet.mapping.runs import dealt
 from facet.mapping.settings import MapSettings
 from facet.mapping.staleness import find_candidates, find_stale, mark_dirty
 from facet.mapping.store import Dirty, VoxelStore
 from facet.mapping.traces import (
-    USED,
+    KNOWN,
     amend,
     begin,
+    find_records,
     forget,
     keep,
     list_changes,
@@ -42,7 +43,6 @@ from facet.mapping.traces import (
 )
 
 CLASS_NAMES = ("empty", "valid", "aligned", "thick", "sparse", "mixed")
-SAME, CHANGED = 0, 1  # what became of a voxel, or WIDER
 NARROW, WIDE = 4, 8  # voxels that the first and the second halo of a block reach beyond it
 SHARES = 16  # parts that the blocks are dealt out to; threads take them
 RUN = 16  # blocks, beside one another in memory, that fall to the same share
@@ -59,85 +59,76 @@ class Normals(NamedTuple):
 
 
 @kernel(allocates=False)
-def _estimate_row(at, normals, row, scratch):  # type: ignore[no-untyped-def]
-    """Estimate one row and write it. SAME, CHANGED, or WIDER where nothing was written."""
-    kind, nx, ny, nz, gamma, border, reach = estimate(at, scratch)
-    if kind == WIDER:
-        return WIDER
-    unit = normals.unit[row]
-    changed = (
-        normals.kind[row] != kind
-        or normals.thickness[row] != gamma
-        or normals.border[row] != border
-        or unit[0] != nx
-        or unit[1] != ny
-        or unit[2] != nz
-    )
-    normals.kind[row] = kind
-    normals.thickness[row] = gamma
-    normals.border[row] = border
-    normals.reach[row] = reach
-    unit[0], unit[1], unit[2] = nx, ny, nz
-    return CHANGED if changed else SAME
+def _write(normals, rows, count, found):  # type: ignore[no-untyped-def]
+    """Write what was found of the voxels rows[:count]. Whether any is another now than before."""
+    changed = False
+    for v in range(count):
+        row, new, unit = rows[v], found[v], normals.unit[rows[v]]
+        changed |= normals.kind[row] != new[0]
+        changed |= unit[0] != new[1] or unit[1] != new[2] or unit[2] != new[3]
+        changed |= normals.thickness[row] != new[4]
+        changed |= normals.border[row] != new[5]
+        normals.kind[row], normals.thickness[row] = new[0], new[4]
+        unit[0], unit[1], unit[2] = new[1], new[2], new[3]
+        normals.border[row], normals.reach[row] = new[5], new[6]
+    return changed
 
 
 @kernel(allocates=False)
 def _estimate_block(  # type: ignore[no-untyped-def]
     blocks, observable, normals, block, stale, dirty, num_changes, rule, halo, traces, share,
-    scratch
+    scratch, found
 ):  # fmt: skip
-    """Estimate the voxels of a block whose bit is set in stale (8,), which comes back clear.
-    Whether any changed. Few need to look far: the wider halos are gathered for them alone.
+    """Estimate the voxels of a block whose bit is set in stale (8,). Whether any changed. Its halo
+    is gathered when the first of them asks for it, and again, wider, when one looks farther.
 
-    dirty (8,): bits of its dirty voxels; num_changes: dirty voxels round it, -1: too many."""
-    turned, state = False, scratch[4]
-    for narrow, margin in ((True, NARROW), (False, WIDE), (False, rule.largest)):
-        left = np.uint64(0)
-        gather(blocks, observable, block, min(margin, rule.largest), halo)
-        for z in range(8):
-            word = stale[z]
-            while word != np.uint64(0):
-                bit = np.int64(trailing_zeros(word))
-                word &= word - np.uint64(1)
-                local = 64 * z + bit
-                row = row_at(blocks, block, local)
-                seen = observable[row]
-                one_line = seen >> 32 != 0  # asks for more than sums
-                is_new = num_changes < 0 or (dirty[z] >> np.uint64(bit)) & np.uint64(1) == 1
-                if is_new:
-                    begin(state)
-                else:
-                    is_whole = recall(traces, share, row, scratch)
-                    if narrow and not (
-                        amend(num_changes, local, seen, rule, scratch) or one_line or not is_whole
-                    ):
-                        stale[z] &= ~(np.uint64(1) << np.uint64(bit))
-                        continue
-                at = halo, min(margin, rule.largest), local, seen, rule
-                became = _estimate_row(at, normals, row, scratch)
-                if num_changes < 0:
-                    forget(traces, share, row)
-                else:
-                    keep(traces, share, row, -1 if became == WIDER else state[USED], scratch)
-                if became != WIDER:
-                    stale[z] &= ~(np.uint64(1) << np.uint64(bit))
-                    turned |= became == CHANGED
-            left |= stale[z]
-        if left == np.uint64(0):
-            break
-    return turned
+    dirty (8,): bits of its dirty voxels; num_changes: dirty voxels round it, -1: too many;
+    found (512, 7): room."""
+    kept, principal, state, listed = scratch[2], scratch[3], scratch[4], scratch[6]
+    rows, places, words, starts = listed[0], listed[1], listed[2], listed[3]
+    number = list_voxels(blocks, block, stale, rows, places)
+    for v in range(number):
+        words[v] = observable[rows[v]]
+    if num_changes >= 0:
+        find_records(traces, share, rows, number, starts)
+    margin, count = 0, 0
+    for v in range(number):
+        row, local, seen = rows[v], places[v], words[v]
+        is_new = (dirty[local >> 6] >> np.uint64(local & 63)) & np.uint64(1) == 1
+        if is_new or num_changes < 0:
+            begin(state)
+        else:
+            is_whole = recall(traces, share, row, starts[v], scratch)
+            is_other = amend(num_changes, local, seen, rule, scratch)
+            one_line = seen >> 32 != 0  # asks for more than sums
+            if is_whole and not (is_other or one_line):
+                continue
+            analyse_all(kept, state[KNOWN], rule.floor2, principal)
+        kind = WIDER
+        while kind == WIDER:
+            at = halo, margin, local, seen, rule
+            kind, nx, ny, nz, gamma, border, reach = estimate(at, scratch)
+            if kind == WIDER:
+                wider = NARROW if margin < NARROW else WIDE if margin < WIDE else rule.largest
+                margin = min(wider, rule.largest)
+                gather(blocks, observable, block, margin, halo)
+        found[count, 0], found[count, 1], found[count, 2], found[count, 3] = kind, nx, ny, nz
+        found[count, 4], found[count, 5], found[count, 6] = gamma, border, reach
+        if num_changes < 0:
+            forget(traces, share, row)
+        else:
+            keep(traces, share, row, scratch)
+        rows[count] = row
+        count += 1
+    return _write(normals, rows, count, found)
 
 
 @kernel(allocates=False)
-def _deepest(blocks, reach, block):  # type: ignore[no-untyped-def]
+def _deepest(blocks, reach, block, listed):  # type: ignore[no-untyped-def]
     """The largest reach of a block's voxels."""
-    largest = np.uint8(0)
-    for z in range(8):
-        word = blocks.occupied[block, z]
-        while word != np.uint64(0):
-            local = 64 * z + np.int64(trailing_zeros(word))
-            word &= word - np.uint64(1)
-            largest = max(largest, reach[row_at(blocks, block, local)])
+    rows, largest = listed[0], np.uint8(0)
+    for v in range(list_voxels(blocks, block, blocks.occupied[block], rows, listed[1])):
+        largest = max(largest, reach[rows[v]])
     return largest
 
 
@@ -155,14 +146,14 @@ def _refresh(  # type: ignore[no-untyped-def]
         share = dealt(turn, halos.rows.shape[0])
         halo = Halo(halos.listed[share], halos.rows[share], halos.first[share], halos.near[share])
         scratch = make_scratch()
-        stale = np.zeros(8, np.uint64)
+        stale, found = np.zeros(8, np.uint64), np.zeros((512, 7), np.int16)
         for q in range(which.shape[0]):
             block = which[q]
             if (block // RUN) % halos.rows.shape[0] != share:
                 continue
             counts[q] = find_stale(
                 blocks, dirty, normals.reach, block, deepest[1 + block], rule.start,
-                halo.near, halo.rows, stale,
+                halo.near, halo.rows, scratch[6], stale,
             )  # fmt: skip
             turned[q] = False
             if counts[q] > 0:
@@ -170,9 +161,9 @@ def _refresh(  # type: ignore[no-untyped-def]
                 num = list_changes(blocks, columns, changes, halo.near, blocks_out, scratch[5])
                 turned[q] = _estimate_block(
                     blocks, columns.observable, normals, block, stale, dirty[block], num, rule,
-                    halo, traces, share, scratch,
+                    halo, traces, share, scratch, found,
                 )  # fmt: skip
-                deepest[1 + block] = _deepest(blocks, normals.reach, block)
+                deepest[1 + block] = _deepest(blocks, normals.reach, block, scratch[6])
 
 
 class NormalField:

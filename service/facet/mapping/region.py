@@ -146,27 +146,3 @@ def within_slab(votes, count, r, nx, ny, nz, own, half, sums):  # type: ignore[n
         szz = np.int32(szz + np.int32(wz * z[i]))
     sums[0], sums[1], sums[2], sums[3], sums[4] = number, weight, sx, sy, sz
     sums[5], sums[6], sums[7], sums[8], sums[9], sums[10] = sxx, sxy, sxz, syy, syz, szz
-
-
-@kernel(allocates=False)
-def covariance(sums):  # type: ignore[no-untyped-def]
-    """(xx, yy, zz, xy, xz, yz) of the votes, population form (eq. 3), (1/8 voxel)^2."""
-    one = 1.0 / sums[1]
-    mx, my, mz = sums[2] * one, sums[3] * one, sums[4] * one
-    return (
-        sums[5] * one - mx * mx,
-        sums[8] * one - my * my,
-        sums[10] * one - mz * mz,
-        sums[6] * one - mx * my,
-        sums[7] * one - mx * mz,
-        sums[9] * one - my * mz,
-    )
-
-
-@kernel(allocates=False)
-def shape(variances, floor2):  # type: ignore[no-untyped-def]
-    """(lambda of eq. 18, tan gamma of eq. 9) of principal variances, floored."""
-    s1 = max(variances[0], floor2)
-    s2 = max(variances[1], floor2)
-    s3 = max(variances[2], floor2)
-    return s2 / np.sqrt(s1 * s3), 1.1547005383792515 * np.sqrt(s3 / np.sqrt(s1 * s2))

@@ -5,8 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from facet.mapping.bits import population, trailing_zeros
-from facet.mapping.blocks import find, pack, unpack
+from facet.mapping.bits import population
+from facet.mapping.blocks import find, list_voxels, pack, unpack
 from facet.mapping.halo import SIDE_BLOCKS, fill_rows, find_near
 from facet.mapping.kernel import kernel
 from facet.mapping.settings import BLOCK
@@ -64,35 +64,37 @@ def find_candidates(blocks, deepest, sources, flags, out):  # type: ignore[no-un
 
 
 @kernel(allocates=False)
-def find_stale(blocks, dirty, reach, block, deepest, common, near, lines, stale):  # type: ignore[no-untyped-def]
+def find_stale(blocks, dirty, reach, block, deepest, common, near, lines, listed, stale):  # type: ignore[no-untyped-def]
     """Set in stale (8,) the bits of a block's voxels that look at a dirty one, or are dirty
-    themselves. `common` is the reach that most voxels have. Returns how many."""
+    themselves. `common` is the reach that most voxels have; listed (3, 512): room. Returns how
+    many."""
     margin = max(common, deepest)
     edge = BLOCK + 2 * margin
     blocks_out = (margin + 7) >> 3
     find_near(blocks, block, blocks_out, near)
     fill_rows(dirty, near, blocks_out, margin, lines)
-    count = 0
+    rows, places, reaches = listed[0], listed[1], listed[2]
+    count = list_voxels(blocks, block, blocks.occupied[block], rows, places)
+    for v in range(count):
+        reaches[v] = reach[rows[v]]
     for z in range(8):
         stale[z] = dirty[block, z]
-        for y in range(8):
-            byte = (blocks.occupied[block, z] >> np.uint64(8 * y)) & np.uint64(255)
-            if byte == np.uint64(0):
-                continue
-            seen = _column(lines, edge, y + margin, z + margin, common)
-            rows = blocks.rows[blocks.lines[block, 8 * z + y]]
-            while byte != np.uint64(0):
-                bit = np.int64(trailing_zeros(byte))
-                byte &= byte - np.uint64(1)
-                r = np.int64(reach[rows[bit] - 1])
-                found = seen
-                if r != common:
-                    found = _column(lines, edge, y + margin, z + margin, r)
-                cube = (np.uint64(1) << np.uint64(2 * r + 1)) - np.uint64(1)
-                if (found >> np.uint64(bit + margin - r)) & cube != np.uint64(0):
-                    stale[z] |= np.uint64(1) << np.uint64(8 * y + bit)
-        count += np.int64(population(stale[z]))
-    return count
+    last, seen = np.int64(-1), np.uint64(0)
+    for v in range(count):
+        r, line, bit = reaches[v], places[v] >> 3, places[v] & 7
+        y, z = (line & 7) + margin, (line >> 3) + margin
+        if line != last:
+            last, seen = line, _column(lines, edge, y, z, common)
+        found = seen
+        if r != common:
+            found = _column(lines, edge, y, z, r)
+        cube = (np.uint64(1) << np.uint64(2 * r + 1)) - np.uint64(1)
+        if (found >> np.uint64(bit + margin - r)) & cube != np.uint64(0):
+            stale[line >> 3] |= np.uint64(1) << np.uint64(places[v] & 63)
+    number = 0
+    for z in range(8):
+        number += np.int64(population(stale[z]))
+    return number
 
 
 @kernel(allocates=False)

@@ -16,23 +16,22 @@ from numpy.typing import NDArray
 
 from facet.mapping.halo import LISTS, take
 from facet.mapping.kernel import kernel
+from facet.mapping.principal import PLACES, analyse, make_principal
 from facet.mapping.region import COLUMNS, MOST, SUMS, decode, is_beside, within, within_slab
 
 SLAB_UNIT = 64  # the normal across a slab is rounded: these integers are a unit vector times this
 CUBE, SLAB, THIN_SLAB = range(3)  # what a key asks for
 FARTHEST = 9  # (2 x 9 + 1)^3 votes are always listed whole; of wider regions nothing is kept
 MOST_KEPT = 12  # sums of a voxel
+PASSING = MOST_KEPT  # place of sums that are not kept, until the next are asked for
 ENTRIES = 96 << 10  # sums of a share that are kept: those begun last
 MOST_CHANGES = 256  # dirty voxels round a block; with more, summing all again is no slower
 KNOWN, USED, LISTED, COUNT, WHOLE = range(5)  # state: sums at hand; a bit each of those asked for;
 # radius up to which the votes are listed; how many these are; whether nothing asked for was dropped
-ENTRY = 16  # numbers of an entry, a cache line: the sums and
-KEY = SUMS  # what they are of
-# and, where those of a voxel begin, else 0
-OWNER = 12  # 1 + row
-ROOM = 13  # how many have room
-NUMBER = 14  # how many there are
-IS_WHOLE = 15  # whether they are all that the last estimate asked for
+KEY = SUMS  # an entry: the sums, what they are of, and where those of a voxel begin, else 0:
+OWNER, ROOM, NUMBER, IS_WHOLE = range(KEY + 1, KEY + 5)  # 1 + row; how many have room; how many
+# there are; whether they are all that the last estimate asked for
+ENTRY = IS_WHOLE + 1  # numbers of an entry: a cache line
 _VOTE = 0xFFFF  # bits of an observable that a sum is made of: centroid and weight
 
 
@@ -62,11 +61,12 @@ def make_scratch():  # type: ignore[no-untyped-def]
     return (
         np.empty((LISTS, MOST + 16), np.int32),  # 16: columns start on different cache sets
         np.empty((COLUMNS, MOST + 16), np.int32),  # votes
-        np.zeros(SUMS, np.int64),  # what was asked for
-        np.zeros((MOST_KEPT, ENTRY), np.int32),  # sums at hand, each with its key
+        np.zeros((PLACES, KEY + 1), np.int32),  # sums at hand, each with its key
+        make_principal(),  # what these say
         np.zeros(5, np.int64),  # KNOWN .. WHOLE
         np.zeros((5, MOST_CHANGES), np.int64),  # dirty voxels round a block: x, y, z from its
         # corner, observable before and now
+        np.zeros((4, 512), np.int64),  # voxels of the block
     )
 
 
@@ -105,52 +105,48 @@ def list_votes(at, reach, scratch):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=False)
 def ask(at, key, reach, scratch):  # type: ignore[no-untyped-def]
-    """Bring the sums that a key names to scratch.sums. Whether the halo is wide enough.
+    """Bring the sums that a key names, and what they say, to hand. Their place there; -1 where the
+    halo is too narrow.
 
     at: halo, its margin, the voxel's place in the block, its observable, rule; reach: the largest
     radius that was asked for, up to which votes are listed."""
-    _, votes, sums, kept, state, _ = scratch
+    _, votes, kept, principal, state, _, _ = scratch
     for e in range(state[KNOWN]):
         if kept[e, KEY] == key:
             state[USED] |= 1 << e
-            for s in range(SUMS):
-                sums[s] = kept[e, s]
-            return True
+            return e
     if not list_votes(at, reach, scratch):
-        return False
+        return -1
     _, _, _, seen, rule = at
+    e = _find_place(reach, state)
+    kept[e, KEY] = key
     r, kind, ix, iy, iz = _read_key(key)
     if kind == CUBE:
-        within(votes, state[COUNT], r, sums)
+        within(votes, state[COUNT], r, kept[e])
     else:
         own = ix * (seen & 15) + iy * ((seen >> 4) & 15) + iz * ((seen >> 8) & 15)
         half = rule.slab if kind == SLAB else rule.thin_slab
-        within_slab(votes, state[COUNT], r, ix, iy, iz, own, half, sums)
-    _remember(key, reach, scratch)
-    return True
+        within_slab(votes, state[COUNT], r, ix, iy, iz, own, half, kept[e])
+    analyse(kept, e, rule.floor2, principal)
+    return e
 
 
 @kernel(allocates=False)
-def _remember(key, reach, scratch):  # type: ignore[no-untyped-def]
-    _, _, sums, kept, state, _ = scratch
-    e = state[KNOWN]
-    if reach > FARTHEST:
-        state[WHOLE] = 0
-        return
-    most = kept.shape[0]
-    if e < most:
-        state[KNOWN] += 1
+def _find_place(reach, state):  # type: ignore[no-untyped-def]
+    """A place for sums that are not at hand: a free one, or of sums not asked for this time, or
+    PASSING."""
+    e = 0
+    if state[KNOWN] < MOST_KEPT:
+        e = state[KNOWN]
     else:
-        e = 0
-        while e < most and (state[USED] >> e) & 1:
+        while e < MOST_KEPT and (state[USED] >> e) & 1:
             e += 1
-        if e == most:
-            state[WHOLE] = 0
-            return
+    if reach > FARTHEST or e == MOST_KEPT:
+        state[WHOLE] = 0
+        return PASSING
+    state[KNOWN] = max(state[KNOWN], e + 1)
     state[USED] |= 1 << e
-    kept[e, KEY] = key
-    for s in range(SUMS):
-        kept[e, s] = sums[s]
+    return e
 
 
 @kernel(allocates=False)
@@ -170,45 +166,50 @@ def _find_record(traces, share, row):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def recall(traces, share, row, scratch):  # type: ignore[no-untyped-def]
-    """Bring what is kept of a voxel to hand. Whether it is all that the last estimate asked for."""
-    kept, state = scratch[3], scratch[4]
+def find_records(traces, share, rows, count, starts):  # type: ignore[no-untyped-def]
+    """Where the sums of each of the voxels rows[:count] begin, -1: it has none. One look-up at a
+    time for all of them: they do not wait for one another."""
+    for v in range(count):
+        starts[v] = np.int64(traces.slot[rows[v]]) - 1
+    for v in range(count):
+        if starts[v] >= 0 and traces.entries[share, starts[v], OWNER] != rows[v] + 1:
+            starts[v] = -1
+
+
+@kernel(allocates=False)
+def recall(traces, share, row, start, scratch):  # type: ignore[no-untyped-def]
+    """Bring what is kept of a voxel, and began at `start`, to hand. Whether it is all that the last
+    estimate asked for."""
+    kept, state = scratch[2], scratch[4]
     begin(state)
-    start = _find_record(traces, share, row)
-    if start < 0:
+    if start < 0 or traces.entries[share, start, OWNER] != row + 1:  # overwritten by now
         return False
     entries = traces.entries[share]
     state[KNOWN] = entries[start, NUMBER]
     for e in range(state[KNOWN]):
-        for s in range(ENTRY):
+        for s in range(KEY + 1):
             kept[e, s] = entries[start + e, s]
     return entries[start, IS_WHOLE] == 1
 
 
 @kernel(allocates=False)
-def keep(traces, share, row, used, scratch):  # type: ignore[no-untyped-def]
-    """Keep those sums at hand whose bits in `used` are set."""
-    kept, state = scratch[3], scratch[4]
+def keep(traces, share, row, scratch):  # type: ignore[no-untyped-def]
+    """Keep those sums at hand that were asked for."""
+    kept, state = scratch[2], scratch[4]
     number = 0
     for e in range(state[KNOWN]):
-        if (used >> e) & 1:
-            if number < e:
-                for s in range(ENTRY):
-                    kept[number, s] = kept[e, s]
-            number += 1
-    entries = traces.entries[share]
+        number += (state[USED] >> e) & 1
     start = _find_record(traces, share, row)
-    if start < 0 or entries[start, ROOM] < number:
+    if start < 0 or traces.entries[share, start, ROOM] < number:
         start = _begin_record(traces, share, row, number)
-    room = entries[start, ROOM]
-    for e in range(number):
-        kept[e, OWNER] = 0
-        for s in range(ENTRY):
-            entries[start + e, s] = kept[e, s]
-    entries[start, OWNER] = row + 1
-    entries[start, ROOM] = room
+    entries = traces.entries[share]
     entries[start, NUMBER] = number
     entries[start, IS_WHOLE] = state[WHOLE]
+    for e in range(state[KNOWN]):
+        if (state[USED] >> e) & 1:
+            for s in range(KEY + 1):
+                entries[start, s] = kept[e, s]
+            start += 1
 
 
 @kernel(allocates=False)
@@ -220,6 +221,7 @@ def _begin_record(traces, share, row, number):  # type: ignore[no-untyped-def]
     traces.next[share] = start + room
     for e in range(start, start + room):
         traces.entries[share, e, OWNER] = 0
+    traces.entries[share, start, OWNER] = row + 1
     traces.entries[share, start, ROOM] = room
     traces.slot[row] = start + 1
     return start
@@ -264,7 +266,7 @@ def list_changes(blocks, columns, dirty, near, blocks_out, changes):  # type: ig
 def amend(num_changes, local, seen, rule, scratch):  # type: ignore[no-untyped-def]
     """Bring the sums at hand from what the changed voxels were to what they are. Whether any sum is
     another now."""
-    kept, state, changes = scratch[3], scratch[4], scratch[5]
+    kept, state, changes = scratch[2], scratch[4], scratch[5]
     farthest = 0
     for e in range(state[KNOWN]):
         farthest = max(farthest, kept[e, KEY] & 31)
@@ -285,9 +287,9 @@ def amend(num_changes, local, seen, rule, scratch):  # type: ignore[no-untyped-d
             if was and counts and (before ^ now) & _VOTE == 0:
                 continue
             if was:
-                _add_vote(dx, dy, dz, before, -1, e, scratch)
+                _add_vote(dx, dy, dz, before, -1, kept[e])
             if counts:
-                _add_vote(dx, dy, dz, now, 1, e, scratch)
+                _add_vote(dx, dy, dz, now, 1, kept[e])
             different |= was or counts
     return different
 
@@ -309,19 +311,18 @@ def _counts(dx, dy, dz, word, key, seen, rule):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _add_vote(dx, dy, dz, word, sign, e, scratch):  # type: ignore[no-untyped-def]
-    """Add a vote to one of the sums at hand, or take it out."""
-    kept = scratch[3]
+def _add_vote(dx, dy, dz, word, sign, sums):  # type: ignore[no-untyped-def]
+    """Add a vote to sums, or take it out."""
     x, y, z = 8 * dx + (word & 15), 8 * dy + ((word >> 4) & 15), 8 * dz + ((word >> 8) & 15)
     w = sign * ((word >> 12) & 15)
-    kept[e, 0] += sign
-    kept[e, 1] += w
-    kept[e, 2] += w * x
-    kept[e, 3] += w * y
-    kept[e, 4] += w * z
-    kept[e, 5] += w * x * x
-    kept[e, 6] += w * x * y
-    kept[e, 7] += w * x * z
-    kept[e, 8] += w * y * y
-    kept[e, 9] += w * y * z
-    kept[e, 10] += w * z * z
+    sums[0] += sign
+    sums[1] += w
+    sums[2] += w * x
+    sums[3] += w * y
+    sums[4] += w * z
+    sums[5] += w * x * x
+    sums[6] += w * x * y
+    sums[7] += w * x * z
+    sums[8] += w * y * y
+    sums[9] += w * y * z
+    sums[10] += w * z * z
