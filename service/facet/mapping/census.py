@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from facet.mapping.bits import trailing_zeros
-from facet.mapping.blocks import CENTRE, row_at, unpack
+from facet.mapping.blocks import CENTRE, list_voxels, unpack
 from facet.mapping.kernel import kernel
 from facet.mapping.normals import ALIGNED, MIXED, SPARSE, THICK, VALID, Normals
 from facet.mapping.patches import Patches
@@ -80,30 +79,27 @@ class Census:
         )
 
 
-@kernel(allocates=False)
+@kernel
 def _fill(blocks, observable, label, id_of_patch, which, tile, centroids, ids):  # type: ignore[no-untyped-def]
+    rows, places = np.empty(512, np.int64), np.empty(512, np.int64)
     count = 0
     for q in range(which.shape[0]):
         block = which[q]
         i, j, k = unpack(blocks.keys[block])
-        corner = (8 * (i - 8 * tile[0]), 8 * (j - 8 * tile[1]), 8 * (k - 8 * tile[2]))
-        for z in range(8):
-            word = blocks.occupied[block, z]
-            while word != np.uint64(0):
-                bit = np.int64(trailing_zeros(word))
-                word &= word - np.uint64(1)
-                row = row_at(blocks, block, 64 * z + bit)
-                seen = observable[row]
-                centroids[count, 0] = 8 * (corner[0] + (bit & 7)) + (seen & 15)
-                centroids[count, 1] = 8 * (corner[1] + (bit >> 3)) + ((seen >> 4) & 15)
-                centroids[count, 2] = 8 * (corner[2] + z) + ((seen >> 8) & 15)
-                ids[count] = 0
-                own = label[row]
-                if own >= 0:
-                    n = own >> 4
-                    other = block if n == CENTRE else blocks.neighbours[block, n]
-                    ids[count] = id_of_patch[other, own & 15]
-                count += 1
+        x, y, z = 64 * (i - 8 * tile[0]), 64 * (j - 8 * tile[1]), 64 * (k - 8 * tile[2])
+        for v in range(list_voxels(blocks, block, blocks.occupied[block], rows, places)):
+            row, place = rows[v], places[v]
+            seen = observable[row]
+            centroids[count, 0] = x + 8 * (place & 7) + (seen & 15)
+            centroids[count, 1] = y + 8 * ((place >> 3) & 7) + ((seen >> 4) & 15)
+            centroids[count, 2] = z + 8 * (place >> 6) + ((seen >> 8) & 15)
+            ids[count] = 0
+            own = label[row]
+            if own >= 0:
+                n = own >> 4
+                other = block if n == CENTRE else blocks.neighbours[block, n]
+                ids[count] = id_of_patch[other, own & 15]
+            count += 1
 
 
 def _ids_of_patches(tiles: TileField) -> NDArray[np.int32]:

@@ -12,7 +12,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from facet.mapping.blocks import CENTRE, Blocks, find, pack, unpack
+from facet.mapping.blocks import CENTRE, Blocks, find, list_rows, pack, unpack
 from facet.mapping.kernel import kernel
 from facet.mapping.runs import dealt
 
@@ -27,28 +27,35 @@ CORNER_COS = 0.8  # planes that share a corner voxel differ by more than 37 degr
 FLAT_COS = 0.95  # planes that all are so near to one differ by less from one another
 NX, NY, NZ, OFFSET, WEIGHT = range(5)  # a candidate's plane: unit normal, offset; of its size
 LOW, HIGH = 5, 8  # its box: least and largest x, y, z
-OFF, WAY = 11, 12  # of the voxel in turn: distance from the plane, signed way x, y, z to the box
-COLUMNS = 15
+OFF = 11  # distance of the voxel in turn from the plane
+COLUMNS = 12
 
 
 class Candidates(NamedTuple):
-    """Patches that may claim the voxels of a block, C of them; scratch of one thread."""
+    """Patches that may claim the voxels of a block: N near ones, C with those two blocks away;
+    scratch of one thread."""
 
     codes: NDArray[np.int16]  # (C,) 16 * neighbour + index
     columns: NDArray[np.float64]  # (COLUMNS, C) eighths, from the corner of the block that asks
     own: NDArray[np.int64]  # (PER_BLOCK,) which of them is the block's own patch, -1: none
     angled: NDArray[np.int16]  # (N, N) for each the near ones that are at an angle to it
     num_angled: NDArray[np.int64]  # (N,) how many these are, -1: not looked up yet
+    parallel: NDArray[np.int16]  # (N, C) for each near one those that are parallel to it
+    num_parallel: NDArray[np.int64]  # (N,) likewise
+    waiting: NDArray[np.int64]  # (N,) those that need another jamb
+    costs: NDArray[np.float64]  # (N,) of these
     places: NDArray[np.int64]  # (125, 5) of the blocks that are asked
 
 
 class Voxels(NamedTuple):
     """The voxels of a block, V of them; scratch of one thread."""
 
-    local: NDArray[np.int64]  # (V,)
-    row: NDArray[np.int64]
+    row: NDArray[np.int64]  # (V,)
+    place: NDArray[np.int64]
     seen: NDArray[np.int64]  # observables
-    member: NDArray[np.int8]
+    member: NDArray[np.int64]
+    label: NDArray[np.int64]
+    second: NDArray[np.int64]
 
 
 @kernel
@@ -56,29 +63,18 @@ def _make_scratch(per_block):  # type: ignore[no-untyped-def]
     most, near = 125 * per_block, 27 * per_block
     found = Candidates(
         np.empty(most, np.int16), np.empty((COLUMNS, most)), np.empty(per_block, np.int64),
-        np.empty((near, near), np.int16), np.empty(near, np.int64), np.empty((125, 5), np.int64),
+        np.empty((near, near), np.int16), np.empty(near, np.int64),
+        np.empty((near, most), np.int16), np.empty(near, np.int64),
+        np.empty(near, np.int64), np.empty(near), np.empty((125, 5), np.int64),
     )  # fmt: skip
-    voxels = Voxels(
-        np.empty(512, np.int64), np.empty(512, np.int64), np.empty(512, np.int64),
-        np.empty(512, np.int8),
-    )  # fmt: skip
-    return found, voxels
+    v = np.empty((6, 512 + 16), np.int64)  # 16: columns start on different cache sets
+    return found, Voxels(v[0], v[1], v[2], v[3], v[4], v[5])
 
 
 @kernel(allocates=False)
-def _gather(blocks, observable, member, block, voxels):  # type: ignore[no-untyped-def]
-    """List the voxels of a block. How many. One look-up at a time for all of them: they do not
-    wait for one another."""
-    count = 0
-    for place in range(64):
-        line = blocks.lines[block, place]
-        if line == 0:
-            continue
-        for x in range(8):
-            row = blocks.rows[line, x] - 1
-            voxels.local[count] = 8 * place + x
-            voxels.row[count] = row
-            count += row >= 0
+def _list(blocks, observable, member, block, voxels):  # type: ignore[no-untyped-def]
+    """List the voxels of a block. How many."""
+    count = list_rows(blocks, block, voxels.row, voxels.place)
     for v in range(count):
         voxels.seen[v] = observable[voxels.row[v]]
     for v in range(count):
@@ -120,7 +116,7 @@ def _add_candidates(patches, places, num_places, tolerance, count, found):  # ty
     return count
 
 
-@kernel
+@kernel(allocates=False)
 def _near_candidates(blocks, patches, block, tolerance, found):  # type: ignore[no-untyped-def]
     """Patches of a block and its 26 neighbours."""
     places, num = found.places, 0
@@ -135,7 +131,7 @@ def _near_candidates(blocks, patches, block, tolerance, found):  # type: ignore[
     for q in range(count):
         if found.codes[q] >> 4 == CENTRE:
             found.own[found.codes[q] & 15] = q
-        found.num_angled[q] = -1
+        found.num_angled[q] = found.num_parallel[q] = -1
     return count
 
 
@@ -153,6 +149,7 @@ def _far_candidates(blocks, patches, block, tolerance, count, found):  # type: i
             places[num, 0], places[num, 1] = other, 0
             places[num, 2], places[num, 3], places[num, 4] = di, dj, dk
             num += 1
+    found.num_parallel[:count] = -1
     return _add_candidates(patches, places, num, tolerance, count, found)
 
 
@@ -160,28 +157,37 @@ def _far_candidates(blocks, patches, block, tolerance, count, found):  # type: i
 def _place(local, seen):  # type: ignore[no-untyped-def]
     """A voxel's rounded centroid, eighths from the block corner."""
     return (
-        8 * (local & 7) + (seen & 15),
-        8 * ((local >> 3) & 7) + ((seen >> 4) & 15),
-        8 * (local >> 6) + ((seen >> 8) & 15),
+        float(8 * (local & 7) + (seen & 15)),
+        float(8 * ((local >> 3) & 7) + ((seen >> 4) & 15)),
+        float(8 * (local >> 6) + ((seen >> 8) & 15)),
     )
 
 
 @kernel(allocates=False)
-def _measure(columns, count, c):  # type: ignore[no-untyped-def]
-    """How far a place is from the planes and boxes of the first `count` candidates."""
-    x, y, z = float(c[0]), float(c[1]), float(c[2])
-    for q in range(count):
-        away = columns[NX, q] * x + columns[NY, q] * y + columns[NZ, q] * z - columns[OFFSET, q]
-        columns[OFF, q] = abs(away)
-    for q in range(count):
-        ahead, behind = columns[LOW, q] - x, columns[HIGH, q] - x
-        columns[WAY, q] = (ahead if ahead > 0.0 else 0.0) + (behind if behind < 0.0 else 0.0)
-    for q in range(count):
-        ahead, behind = columns[LOW + 1, q] - y, columns[HIGH + 1, q] - y
-        columns[WAY + 1, q] = (ahead if ahead > 0.0 else 0.0) + (behind if behind < 0.0 else 0.0)
-    for q in range(count):
-        ahead, behind = columns[LOW + 2, q] - z, columns[HIGH + 2, q] - z
-        columns[WAY + 2, q] = (ahead if ahead > 0.0 else 0.0) + (behind if behind < 0.0 else 0.0)
+def _off(columns, q, c):  # type: ignore[no-untyped-def]
+    """Distance of a place from the plane of a candidate."""
+    return abs(
+        columns[NX, q] * c[0] + columns[NY, q] * c[1] + columns[NZ, q] * c[2] - columns[OFFSET, q]
+    )
+
+
+@kernel(allocates=False)
+def _way(columns, q, axis, x):  # type: ignore[no-untyped-def]
+    """Signed way along an axis from x to the box of a candidate."""
+    ahead, behind = columns[LOW + axis, q] - x, columns[HIGH + axis, q] - x
+    return (ahead if ahead > 0.0 else 0.0) + (behind if behind < 0.0 else 0.0)
+
+
+@kernel(allocates=False)
+def _ways(columns, q, c):  # type: ignore[no-untyped-def]
+    return _way(columns, q, 0, c[0]), _way(columns, q, 1, c[1]), _way(columns, q, 2, c[2])
+
+
+@kernel(allocates=False)
+def _gap(columns, q, c):  # type: ignore[no-untyped-def]
+    """Chebyshev distance of a place from the box of a candidate."""
+    x, y, z = _ways(columns, q, c)
+    return max(abs(x), abs(y), abs(z))
 
 
 @kernel(allocates=False)
@@ -194,28 +200,22 @@ def _dot(columns, q, o):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _gap(columns, q):  # type: ignore[no-untyped-def]
-    """Chebyshev distance of the voxel in turn from a candidate's box."""
-    return max(abs(columns[WAY, q]), abs(columns[WAY + 1, q]), abs(columns[WAY + 2, q]))
-
-
-@kernel(allocates=False)
 def _cost(columns, q, gap, tolerance):  # type: ignore[no-untyped-def]
     off = columns[OFF, q] / tolerance
     return off**2 + (gap / (8.0 * LEFTOVER_REACH)) ** 2 + columns[WEIGHT, q]
 
 
 @kernel(allocates=False)
-def _join(columns, count, seen, tolerance):  # type: ignore[no-untyped-def]
-    """Candidate that a leftover joins, -1: none. It must face the voxel's sensor, its plane must
-    be near, and so must its box."""
+def _join(columns, near, c, seen, tolerance):  # type: ignore[no-untyped-def]
+    """Near candidate that a leftover at c joins, -1: none. It must face the voxel's sensor, its
+    plane must be near, and so must its box."""
     v0, v1, v2 = ((seen >> 16) & 31) - 8, ((seen >> 21) & 31) - 8, ((seen >> 26) & 31) - 8
     mixed = ((seen >> 31) & 1) == 1
     best, best_cost = -1, np.inf
-    for q in range(count):
+    for q in range(near):
         if columns[OFF, q] > tolerance:
             continue
-        gap = _gap(columns, q)
+        gap = _gap(columns, q, c)
         if gap > 8 * LEFTOVER_REACH:
             continue
         faces = columns[NX, q] * v0 + columns[NY, q] * v1 + columns[NZ, q] * v2
@@ -228,71 +228,63 @@ def _join(columns, count, seen, tolerance):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _bridged(columns, count, q, tolerance):  # type: ignore[no-untyped-def]
-    """Whether the voxel in turn lies between candidate q and another of the same plane: on a
+def _bridged(found, count, q, c, tolerance):  # type: ignore[no-untyped-def]
+    """Whether c lies between candidate q and another, of all `count`, of the same plane: on a
     threshold. (What is its own is none: the way to itself is no way back.)"""
-    qx, qy, qz = columns[NX, q], columns[NY, q], columns[NZ, q]
-    x, y, z = columns[WAY, q], columns[WAY + 1, q], columns[WAY + 2, q]
+    columns, parallel = found.columns, found.parallel[q]
+    if found.num_parallel[q] < 0:
+        number = 0
+        for o in range(count):
+            parallel[number] = o
+            number += _dot(columns, q, o) >= PARALLEL_COS
+        found.num_parallel[q] = number
+    x, y, z = _ways(columns, q, c)
     length = x * x + y * y + z * z
-    hits = 0
-    for o in range(count):
-        ox, oy, oz = columns[WAY, o], columns[WAY + 1, o], columns[WAY + 2, o]
+    for p in range(found.num_parallel[q]):
+        o = parallel[p]
+        ox, oy, oz = _ways(columns, o, c)
         dot = x * ox + y * oy + z * oz
         lengths = length * (ox * ox + oy * oy + oz * oz)
-        back = (dot < 0.0) & (dot * dot > 0.5 * lengths)
-        cos = qx * columns[NX, o] + qy * columns[NY, o] + qz * columns[NZ, o]
-        hits += np.int64(back & (cos >= PARALLEL_COS) & (columns[OFF, o] <= tolerance))
-    return hits > 0
+        if dot < 0.0 and dot * dot > 0.5 * lengths and _off(columns, o, c) <= tolerance:
+            return True
+    return False
 
 
 @kernel(allocates=False)
-def _claim(found, near, count, tolerance, own):  # type: ignore[no-untyped-def]
-    """Candidate of the first `near`, at an angle to `own`, that claims the voxel in turn at the
-    least cost: as a corner, or as a threshold with the help of any of the `count`.
+def _claim(found, near, count, c, tolerance, own):  # type: ignore[no-untyped-def]
+    """Candidate of the first `near`, at an angle to `own`, that claims the voxel at c for the least
+    cost: as a corner, or as a threshold with the help of any of the `count`.
 
     Returns (candidate, -1: none; whether a better one was left out for want of the other jamb)."""
-    columns, angled = found.columns, found.angled
+    columns, angled = found.columns, found.angled[own]
     if found.num_angled[own] < 0:
         number = 0
         for q in range(near):
-            if _dot(columns, q, own) <= CORNER_COS:
-                angled[own, number] = q
-                number += 1
+            angled[number] = q
+            number += _dot(columns, q, own) <= CORNER_COS
         found.num_angled[own] = number
-    best, best_cost = _best_corner(columns, angled[own], found.num_angled[own], tolerance)
-    alone = False
+    best, best_cost, num_waiting = -1, np.inf, 0
     for a in range(found.num_angled[own]):
-        q = angled[own, a]
+        q = np.int64(angled[a])
         if columns[OFF, q] > tolerance:
             continue
-        gap = _gap(columns, q)
-        if gap <= 8 * CLAIM_REACH:
-            continue
+        gap = _gap(columns, q, c)
         cost = _cost(columns, q, gap, tolerance)
+        if gap > 8 * CLAIM_REACH:
+            found.waiting[num_waiting], found.costs[num_waiting] = q, cost
+            num_waiting += 1
+        elif cost < best_cost:
+            best, best_cost = q, cost
+    alone = False
+    for w in range(num_waiting):  # the dear question last, and only where it can win
+        q, cost = found.waiting[w], found.costs[w]
         if cost > best_cost or (cost == best_cost and q > best):
             continue
-        if _bridged(columns, count, q, tolerance):
+        if _bridged(found, count, q, c, tolerance):
             best, best_cost = q, cost
         else:
             alone = True
     return best, alone
-
-
-@kernel(allocates=False)
-def _best_corner(columns, angled, number, tolerance):  # type: ignore[no-untyped-def]
-    """(candidate, cost) of those beside the voxel in turn; (-1, infinity) where none is."""
-    best, best_cost = -1, np.inf
-    for a in range(number):
-        q = angled[a]
-        if columns[OFF, q] > tolerance:
-            continue
-        gap = _gap(columns, q)
-        if gap > 8 * CLAIM_REACH:
-            continue
-        cost = _cost(columns, q, gap, tolerance)
-        if cost < best_cost:
-            best, best_cost = q, cost
-    return best, best_cost
 
 
 @kernel(allocates=False)
@@ -339,41 +331,41 @@ def label_blocks(
         _label_all(blocks, observable, patches, which, tolerance, changed)
 
 
-@kernel
+@kernel(allocates=False)
 def _label_block(blocks, observable, patches, block, tolerance, scratch):  # type: ignore[no-untyped-def]
     """Label the voxels of one block. Whether a label changed."""
     found, voxels = scratch
-    changed, far = False, False
-    near = _near_candidates(blocks, patches, block, tolerance, found)
-    count = near
-    columns = found.columns
+    near = count = _near_candidates(blocks, patches, block, tolerance, found)
+    columns, far = found.columns, False
     flat = _flat(columns, near)
-    for v in range(_gather(blocks, observable, patches.member, block, voxels)):
+    number = _list(blocks, observable, patches.member, block, voxels)
+    for v in range(number):
         seen, member = voxels.seen[v], voxels.member[v]
         label, second, own = -1, -1, -1
         if seen != 0:
-            c = _place(voxels.local[v], seen)
+            c = _place(voxels.place[v], seen)
             if member < 0 or not flat:
-                _measure(columns, count, c)
+                for q in range(near):
+                    columns[OFF, q] = _off(columns, q, c)
             if member >= 0:
                 label, own = 16 * CENTRE + member, found.own[member]
             else:
-                own = _join(columns, near, seen, tolerance)
+                own = _join(columns, near, c, seen, tolerance)
                 if own >= 0:
-                    label = found.codes[own]
+                    label = np.int64(found.codes[own])
             if own >= 0 and not flat:
-                other, alone = _claim(found, near, count, tolerance, own)
+                other, alone = _claim(found, near, count, c, tolerance, own)
                 if alone and not far:
                     far = True
                     count = _far_candidates(blocks, patches, block, tolerance, near, found)
-                    _measure(columns, count, c)
-                    other, alone = _claim(found, near, count, tolerance, own)
+                    other, alone = _claim(found, near, count, c, tolerance, own)
                 if other >= 0:
-                    second = found.codes[other]
-        row = voxels.row[v]
-        if patches.label[row] != label or patches.second[row] != second:
-            patches.label[row] = label
-            patches.second[row] = second
-            changed = True
+                    second = np.int64(found.codes[other])
+        voxels.label[v], voxels.second[v] = label, second
     patches.far[block] = far
+    changed = False
+    for v in range(number):
+        row, label, second = voxels.row[v], voxels.label[v], voxels.second[v]
+        changed |= patches.label[row] != label or patches.second[row] != second
+        patches.label[row], patches.second[row] = label, second
     return changed

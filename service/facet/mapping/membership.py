@@ -12,8 +12,8 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from facet.mapping.bits import population, trailing_zeros
-from facet.mapping.blocks import CENTRE, row_at, unpack
+from facet.mapping.bits import population
+from facet.mapping.blocks import CENTRE, list_voxels, unpack
 from facet.mapping.kernel import kernel
 
 SHELL = 1000  # places of blocks in a tile and in the shell round it
@@ -72,35 +72,35 @@ class Chain(NamedTuple):
 
 
 @kernel(allocates=False)
-def _collect(blocks, patches, plane_of_patch, tile_key, block, members):  # type: ignore[no-untyped-def]
-    """Voxels of a block whose patch, own or claiming, lies in the tile. How many."""
+def _collect(blocks, patches, plane_of_patch, tile_key, block, listed, members):  # type: ignore[no-untyped-def]
+    """Voxels of a block whose patch, own or claiming, lies in the tile. How many. listed (4, 512):
+    room."""
     rows, owner, claimed = members
     ti, tj, tk = unpack(tile_key)
     i, j, k = unpack(blocks.keys[block])
+    voxels, labels = listed[0], listed[2:]
+    number = list_voxels(blocks, block, blocks.occupied[block], voxels, listed[1])
+    for v in range(number):
+        labels[0, v], labels[1, v] = patches.label[voxels[v]], patches.second[voxels[v]]
     count = 0
-    for z in range(8):
-        word = blocks.occupied[block, z]
-        while word != np.uint64(0):
-            bit = np.int64(trailing_zeros(word))
-            word &= word - np.uint64(1)
-            row = row_at(blocks, block, 64 * z + bit)
-            for claim in range(2):
-                label = patches.second[row] if claim else patches.label[row]
-                if label < 0:
-                    continue
-                n = label >> 4
-                x, y, w = i + n % 3 - 1, j + (n // 3) % 3 - 1, k + n // 9 - 1
-                if x >> 3 != ti or y >> 3 != tj or w >> 3 != tk:
-                    continue
-                other = block if n == CENTRE else blocks.neighbours[block, n]
-                rows[count] = row
-                owner[count] = plane_of_patch[other, label & 15]
-                claimed[count] = claim == 1
-                count += 1
+    for v in range(number):
+        for claim in range(2):
+            label = labels[claim, v]
+            if label < 0:
+                continue
+            n = label >> 4
+            x, y, z = i + n % 3 - 1, j + (n // 3) % 3 - 1, k + n // 9 - 1
+            if x >> 3 != ti or y >> 3 != tj or z >> 3 != tk:
+                continue
+            other = block if n == CENTRE else blocks.neighbours[block, n]
+            rows[count] = voxels[v]
+            owner[count] = plane_of_patch[other, label & 15]
+            claimed[count] = claim == 1
+            count += 1
     return count
 
 
-@kernel
+@kernel(allocates=False)
 def _shell(blocks, flags, tile_key, members, near):  # type: ignore[no-untyped-def]
     """Blocks of a tile, `members`, and those round them into near (SHELL,), by ascending key, -1
     where there is none. Returns how many members can be in those that are flagged."""
@@ -126,7 +126,7 @@ def _shell(blocks, flags, tile_key, members, near):  # type: ignore[no-untyped-d
     return room
 
 
-@kernel
+@kernel(allocates=False)
 def find_shells(blocks, flags, tile_keys, members, member_starts, near, room):  # type: ignore[no-untyped-def]
     """For each tile, whose blocks begin at members[member_starts[n]], the blocks that may hold its
     members, near (N, SHELL), and room (N,): as many as there can be in flagged ones."""
@@ -212,7 +212,7 @@ def _take_over(before, r, plane, chain, listed, run, counts):  # type: ignore[no
     listed.size[run], listed.start[run], listed.old[run] = before.size[r], start, r
 
 
-@kernel
+@kernel(allocates=False)
 def _split(members, count, block, listed, num, end):  # type: ignore[no-untyped-def]
     """List the members of a block as new runs, one for each tile-plane, whose rows begin at `end`.
     Returns (runs, rows) that are listed now."""
@@ -292,7 +292,7 @@ def _list_runs(  # type: ignore[no-untyped-def]
     """List the runs of a tile by block. How many."""
     room = 2 * VOXELS
     members = np.empty(room, np.int32), np.empty(room, np.int16), np.empty(room, np.bool_)
-    was = np.zeros(VOXELS, np.int16)
+    was, voxels = np.zeros(VOXELS, np.int16), np.empty((4, VOXELS), np.int64)
     num, end = 0, 0
     for place in range(SHELL):
         block = near[place]
@@ -307,7 +307,7 @@ def _list_runs(  # type: ignore[no-untyped-def]
                 r = chain.link[r - chain.first]
             continue
         begin = num
-        count = _collect(blocks, patches, plane_of_patch, tile_key, block, members)
+        count = _collect(blocks, patches, plane_of_patch, tile_key, block, voxels, members)
         num, end = _split(members, count, block, listed, num, end)
         _recognise(before, place, chain, into, listed, begin, num, counts)
         _inherit(before, place, chain, local, listed, begin, num, was, counts)

@@ -164,7 +164,7 @@ def _root(parent, t):  # type: ignore[no-untyped-def]
     return t
 
 
-@kernel
+@kernel(allocates=False)
 def _try(votes, mean, scatter, unit, normals, narrow, a, b, limit, m, s, u):  # type: ignore[no-untyped-def]
     """Whether a and b (a the larger) are one plane; m, s, u are then its statistics, and what comes
     with it its normal and the variance across it."""

@@ -13,20 +13,19 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from facet.mapping.bits import trailing_zeros
-from facet.mapping.blocks import row_at
+from facet.mapping.blocks import list_rows, list_voxels, row_at
 from facet.mapping.claims import HALF, OFFSET_STEP, label_blocks
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory
 from facet.mapping.normals import VALID, Normals
 from facet.mapping.rungs import FIRST_RUNG, LIMITS, RUNG_STEP, RUNGS, read_rungs
-from facet.mapping.runs import dealt
+from facet.mapping.runs import SHARES, dealt
 from facet.mapping.settings import STEPS, MapSettings
 from facet.mapping.staleness import find_dependents
 from facet.mapping.store import VoxelStore
 
 PER_BLOCK = 12  # patches of a block; what finds no place is a leftover
-SHARES = 16  # parts that the blocks are dealt out to; threads take them
+NORMAL_STEPS = 128.0  # the normal of a patch, as labels see it, is rounded to so many of one
 FEW = 512  # blocks that are not worth waking other threads for
 
 
@@ -100,22 +99,16 @@ def _join(votes, centroid, unit, count, c, n, grouping):  # type: ignore[no-unty
 @kernel
 def _group(blocks, observable, normals, patches, block, grouping, scratch):  # type: ignore[no-untyped-def]
     """Group a block's valid voxels, best thickness angle first. Returns how many patches."""
-    votes, centroid, scatter, unit, box, label = scratch
+    votes, centroid, scatter, unit, box, label, rows, places = scratch
     votes[:] = 0
     centroid[:] = 0
     scatter[:] = 0
     unit[:] = 0
     order = np.empty(512, np.int32)
     num = 0
-    for z in range(8):
-        word = blocks.occupied[block, z]
-        while word != np.uint64(0):
-            bit = np.int64(trailing_zeros(word))
-            word &= word - np.uint64(1)
-            row = row_at(blocks, block, 64 * z + bit)
-            if normals.kind[row] == VALID:
-                order[num] = (np.int32(normals.thickness[row]) << 9) | (64 * z + bit)
-                num += 1
+    for v in range(list_voxels(blocks, block, blocks.occupied[block], rows, places)):
+        order[num] = (np.int32(normals.thickness[rows[v]]) << 9) | places[v]
+        num += normals.kind[rows[v]] == VALID
     ordered = np.sort(order[:num])
     label[:] = -1
     count = 0
@@ -156,11 +149,11 @@ def _group(blocks, observable, normals, patches, block, grouping, scratch):  # t
 
 @kernel(allocates=False)
 def _round_plane(votes, centroid, unit, plane):  # type: ignore[no-untyped-def]
-    """A patch as the labels of voxels see it: its normal in 128ths, its offset from the middle of
-    the block in OFFSET_STEP, and the bit length of its votes. Most changes of its members leave
-    it as it is. Writes plane (5,); whether it is another now."""
+    """A patch as the labels of voxels see it: its normal in NORMAL_STEPS, its offset from the
+    middle of the block in OFFSET_STEP, and the bit length of its votes. Most changes of its members
+    leave it as it is. Writes plane (5,); whether it is another now."""
     u = unit[0], unit[1], unit[2]
-    scale = 128.0 / np.sqrt(float(u[0] * u[0] + u[1] * u[1] + u[2] * u[2]))
+    scale = NORMAL_STEPS / np.sqrt(float(u[0] * u[0] + u[1] * u[1] + u[2] * u[2]))
     x, y, z = np.rint(u[0] * scale), np.rint(u[1] * scale), np.rint(u[2] * scale)
     along = (
         x * (centroid[0] / votes - HALF)
@@ -181,7 +174,7 @@ def _round_plane(votes, centroid, unit, plane):  # type: ignore[no-untyped-def]
 def _store(blocks, patches, block, count, scratch):  # type: ignore[no-untyped-def]
     """Write a block's grouping. Whether it differs from what was there, and whether for the labels
     of other blocks."""
-    votes, centroid, scatter, unit, box, label = scratch
+    votes, centroid, scatter, unit, box, label, rows, places = scratch
     changed = shows = patches.number[block] != count
     patches.number[block] = count
     for p in range(count):
@@ -198,11 +191,9 @@ def _store(blocks, patches, block, count, scratch):  # type: ignore[no-untyped-d
             patches.scatter[block, p, a] = scatter[p, a]
             patches.box[block, p, a] = box[p, a]
         shows |= _round_plane(votes[p], centroid[p], unit[p], patches.plane[block, p])
-    for local in range(512):
-        row = row_at(blocks, block, local)
-        if row >= 0 and patches.member[row] != label[local]:
-            patches.member[row] = label[local]
-            changed = True
+    for v in range(list_rows(blocks, block, rows, places)):
+        changed |= patches.member[rows[v]] != label[places[v]]
+        patches.member[rows[v]] = label[places[v]]
     return changed | shows, shows
 
 
@@ -216,6 +207,8 @@ def _group_some(  # type: ignore[no-untyped-def]
         np.zeros((PER_BLOCK, 6), np.int64),
         np.zeros((PER_BLOCK, 3), np.int64),
         np.zeros((PER_BLOCK, 6), np.int64),
+        np.zeros(512, np.int64),
+        np.zeros(512, np.int64),
         np.zeros(512, np.int64),
     )
     for q in range(start, stop):

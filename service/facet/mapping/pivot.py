@@ -146,12 +146,11 @@ def mark_changes(old, new, near):  # type: ignore[no-untyped-def]
     return found
 
 
-@kernel
-def _roll(window, wanted, arcs, around, spans, edges):  # type: ignore[no-untyped-def]
+@kernel(allocates=False)
+def _roll(window, wanted, arcs, around, spans, gaps, ends, edges):  # type: ignore[no-untyped-def]
     """Edges (u, v, u', v') that start in the wanted cells (CELLS, CELLS) of the window's middle
-    tile, grid units from the tile's corner. Returns how many, or -1 where `edges` is too short."""
-    gaps = np.empty((64, 2))
-    ends = np.empty((64, 2), np.int64)
+    tile, grid units from the tile's corner. Returns how many, or -1 where `edges` is too short.
+    gaps, ends (64, 2): room."""
     num = 0
     for row in range(CELLS):
         for column in range(CELLS):
@@ -216,13 +215,15 @@ def _exposed(window, row, column, pu, pv, arcs, around, spans, gaps, ends):  # t
 @kernel(parallel=True)
 def _roll_all(windows, wanted, arcs, around, spans, edges, counts):  # type: ignore[no-untyped-def]
     for n in prange(windows.shape[0]):
-        counts[n] = _roll(windows[n], wanted[n], arcs, around, spans, edges[n])
+        gaps, ends = np.empty((64, 2)), np.empty((64, 2), np.int64)
+        counts[n] = _roll(windows[n], wanted[n], arcs, around, spans, gaps, ends, edges[n])
 
 
 @kernel
 def _roll_some(windows, wanted, arcs, around, spans, edges, counts):  # type: ignore[no-untyped-def]
+    gaps, ends = np.empty((64, 2)), np.empty((64, 2), np.int64)
     for n in range(windows.shape[0]):
-        counts[n] = _roll(windows[n], wanted[n], arcs, around, spans, edges[n])
+        counts[n] = _roll(windows[n], wanted[n], arcs, around, spans, gaps, ends, edges[n])
 
 
 def boundary_edges(

@@ -11,7 +11,7 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from facet.mapping.blocks import CENTRE, Blocks
+from facet.mapping.blocks import CENTRE, Blocks, list_voxels
 from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.runs import SHARES, dealt
@@ -29,19 +29,10 @@ PURE_SHARE = 4  # one point in so many must be pure for the rung to be read from
 def _list_members(blocks, border, patches, block, members):  # type: ignore[no-untyped-def]
     """List the voxels that go with a patch of their own block, as members (4, 512): row, place in
     the block, patch, and whether they are pure: not at a border, and claimed by no plane at an
-    angle. How many. One look-up at a time for all of them: they do not wait for one another."""
+    angle. How many."""
     rows, places, owners, are_pure = members[0], members[1], members[2], members[3]
-    occupied = 0
-    for place in range(64):
-        line = blocks.lines[block, place]
-        if line == 0:
-            continue
-        for x in range(8):
-            rows[occupied] = blocks.rows[line, x] - 1
-            places[occupied] = 8 * place + x
-            occupied += rows[occupied] >= 0
     count = 0
-    for v in range(occupied):
+    for v in range(list_voxels(blocks, block, blocks.occupied[block], rows, places)):
         row = rows[v]
         label = np.int64(patches.label[row])
         rows[count], places[count], owners[count] = row, places[v], label & 15

@@ -190,7 +190,7 @@ def _leave(sources, before, m, corner, tally, t, sums):  # type: ignore[no-untyp
         _change(sources, before.rows[m], corner, -1, False, tally, t, sums)
 
 
-@kernel
+@kernel(allocates=False)
 def _merge(sources, before, old, held, r, corner, tally, t, sums):  # type: ignore[no-untyped-def]
     """Take out of a tile-plane what a run lost against its old one, and count what it won, which is
     not PURE yet. Both have their members in order of their places in the block."""
