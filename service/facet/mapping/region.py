@@ -1,4 +1,4 @@
-"""The votes of a cubic region, and what their moments say (eq. 2-10, 18).
+"""The votes of a cubic region, and their sums. What these say: `principal`.
 
 Votes are unpacked once, to columns of 32-bit integers with what decides whether they count; every
 radius, side and slab is then one pass over these short columns, eight votes at a time in vector
