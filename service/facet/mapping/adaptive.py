@@ -118,7 +118,7 @@ def _step(number, ratio, r, rule):  # type: ignore[no-untyped-def]
 def _find_radius(at, rule, scratch):  # type: ignore[no-untyped-def]
     """Follow the radius until it repeats; of a cycle the smallest. (place of the sums, -1 where
     it would leave the halo; radius; reach: the largest radius that was looked at)."""
-    kept, principal, state = scratch[2], scratch[3], scratch[4]
+    kept, principal, state = scratch.kept, scratch.principal, scratch.state
     r = rule.start
     reach = r
     visited = np.int64(0)
@@ -146,7 +146,7 @@ def estimate(at, scratch):  # type: ignore[no-untyped-def]
 
     at: halo, its margin, the voxel's place in the block, its observable, rule."""
     _, _, _, seen, rule = at
-    lists, votes, kept, state = scratch[0], scratch[1], scratch[2], scratch[4]
+    votes, kept, state = scratch.votes, scratch.kept, scratch.state
     if seen == 0:
         return EMPTY, 0, 0, 0, 0, False, 0
     whole, r, reach = _find_radius(at, rule, scratch)
@@ -155,7 +155,7 @@ def estimate(at, scratch):  # type: ignore[no-untyped-def]
         return WIDER, 0, 0, 0, 0, False, 0
     if kept[whole, 0] < rule.sparse:
         return SPARSE, 0, 0, 0, 0, False, reach
-    one_pose = one_line and is_one_pose(lists, votes, state[COUNT], r)
+    one_pose = one_line and is_one_pose(votes, scratch.poses, state[COUNT], r)
     region = at, r, reach, one_pose
     kind, nx, ny, nz, tan_gamma = _classify(whole, seen, one_pose, rule, scratch)
     e = whole
@@ -187,7 +187,7 @@ def _look_closer(region, kind, nx, ny, nz, tan_gamma, whole, scratch):  # type: 
     Returns (class, normal, tan gamma, place of the sums that they are of, -1: there is none)."""
     at, r, reach, one_pose = region
     _, _, _, seen, rule = at
-    kept = scratch[2]
+    kept = scratch.kept
     number, of_whole = np.int64(kept[whole, 0]), tan_gamma  # of all that the region holds
     outlier = rule.outlier * ((seen >> 12) & 15) * number <= kept[whole, 1]  # few among many
     beside = kind == THICK and tan_gamma <= rule.tan_theta  # a plane, not on it: a noise shell
@@ -227,7 +227,7 @@ def _look_again(region, nx, ny, nz, slab, passes, least, scratch):  # type: igno
     and in its own slab. Returns what `_look_closer` does; SPARSE where these are fewer than
     `least`."""
     at, r, reach, one_pose = region
-    seen, rule, kept = at[3], at[4], scratch[2]
+    seen, rule, kept = at[3], at[4], scratch.kept
     kind, tan_gamma, e = SPARSE, 0.0, -1
     last = np.int64(-1)
     for _ in range(passes):
@@ -269,7 +269,7 @@ def _towards(seen, nx, ny, nz):  # type: ignore[no-untyped-def]
 def _classify(e, seen, one_pose, rule, scratch):  # type: ignore[no-untyped-def]
     """(class, normal towards the view, tan gamma) of the voxel with observable `seen`, by the sums
     at a place."""
-    sums, principal = scratch[2][e], scratch[3]
+    sums, principal = scratch.kept[e], scratch.principal
     nx, ny, nz = principal[NX + e], principal[NY + e], principal[NZ + e]
     tan_gamma = principal[TAN_GAMMA + e]
     if _towards(seen, nx, ny, nz) < 0.0:

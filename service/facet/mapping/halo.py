@@ -15,30 +15,54 @@ from numpy.typing import NDArray
 from facet.mapping.bits import population, trailing_zeros
 from facet.mapping.blocks import find, pack, unpack
 from facet.mapping.kernel import kernel
+from facet.mapping.lanes import LANES, load, store
 from facet.mapping.settings import BLOCK
 
 WIDEST = 20  # voxels that a halo may reach beyond its block on each side
 EDGE = BLOCK + 2 * WIDEST
-LISTS = 3  # what is listed of a voxel: low and high half of its observable, packed place
 SIDE_BLOCKS = 7  # blocks along an edge of the widest halo
+COLUMNS = 4  # 16-bit numbers listed of a voxel: x, y, z, view. x, y and z are 16 x its place from
+# the corner of the halo + its centroid in it, 1/8 voxels; x has the weight of its vote from bit
+# IN_X on; the view is the observable's, and negative where that is of both sides
+IN_X = 10
 
 
 class Halo(NamedTuple):
     """Scratch of one thread: the surroundings of one block at a time."""
 
-    listed: NDArray[np.int32]  # (LISTS, EDGE^3) the occupied voxels, x fastest
+    votes: NDArray[np.int16]  # (COLUMNS, EDGE^3 + LANES) of the occupied voxels, x fastest
+    poses: NDArray[np.int32]  # (EDGE^3,) likewise, the high halves of their observables
+    words: NDArray[np.int32]  # (2, EDGE^3) likewise, the low halves; packed places
     rows: NDArray[np.uint64]  # (EDGE^2,) a bit per x of the row (z, y), y fastest
     first: NDArray[np.int32]  # (EDGE^2,) where the row starts in the list
+    filled: NDArray[np.uint64]  # (EDGE,) a bit per y of the rows at z: it holds a voxel
     near: NDArray[np.int32]  # (SIDE_BLOCKS^3,) blocks, -1: none
 
 
 def make_halos(count: int) -> Halo:
-    """Scratch for `count` threads, stacked: 1.4 MB each, of which only what is used gets memory."""
+    """Scratch for `count` threads, stacked: 3 MB each, of which only what is used gets memory."""
     return Halo(
-        np.empty((count, LISTS, EDGE**3), np.int32),
+        np.empty((count, COLUMNS, EDGE**3 + LANES), np.int16),
+        np.empty((count, EDGE**3), np.int32),
+        np.empty((count, 2, EDGE**3), np.int32),
         np.empty((count, EDGE**2), np.uint64),
         np.empty((count, EDGE**2), np.int32),
+        np.empty((count, EDGE), np.uint64),
         np.empty((count, SIDE_BLOCKS**3), np.int32),
+    )
+
+
+@kernel
+def halo_of(halos, share):  # type: ignore[no-untyped-def]
+    """That of one thread."""
+    return Halo(
+        halos.votes[share],
+        halos.poses[share],
+        halos.words[share],
+        halos.rows[share],
+        halos.first[share],
+        halos.filled[share],
+        halos.near[share],
     )
 
 
@@ -93,13 +117,15 @@ def gather(blocks, observable, block, margin, halo):  # type: ignore[no-untyped-
     edge = BLOCK + 2 * margin
     find_near(blocks, block, blocks_out, halo.near)
     fill_rows(blocks.occupied, halo.near, blocks_out, margin, halo.rows)
-    words, poses, places = halo.listed[0], halo.listed[1], halo.listed[2]
+    words, poses, places = halo.words[0], halo.poses, halo.words[1]
+    halo.filled[:edge] = np.uint64(0)
     count = 0
     for line in range(edge * edge):
         halo.first[line] = count
         row = halo.rows[line]
         if row == np.uint64(0):
             continue
+        halo.filled[line // edge] |= np.uint64(1) << np.uint64(line % edge)
         y, z = line % edge - margin, line // edge - margin
         start = width * ((y >> 3) + blocks_out) + width * width * ((z >> 3) + blocks_out)
         inside, cell, voxels = 8 * (z & 7) + (y & 7), np.int64(-99), blocks.rows[0]
@@ -118,33 +144,55 @@ def gather(blocks, observable, block, margin, halo):  # type: ignore[no-untyped-
         seen = observable[words[i]]
         words[i] = seen
         poses[i] = seen >> 32
+    _spread(words, places, count, halo.votes)
 
 
 @kernel(allocates=False)
-def take(halo, margin, x, y, z, r, most, poses_too, out):  # type: ignore[no-untyped-def]
+def _spread(words, places, count, votes):  # type: ignore[no-untyped-def]
+    """What votes say, from low halves of observables and packed places, into their columns."""
+    x, y, z, view = votes[0], votes[1], votes[2], votes[3]
+    for i in range(count):  # few columns a loop: the compiler must see that they do not overlap
+        word, place = words[i], places[i]
+        x[i] = (16 * (place & 255) + (word & 15)) | (((word >> 12) & 15) << IN_X)
+        y[i] = 16 * ((place >> 8) & 255) + ((word >> 4) & 15)
+    for i in range(count):
+        word, place = words[i], places[i]
+        z[i] = 16 * (place >> 16) + ((word >> 8) & 15)
+        view[i] = word >> 16
+
+
+@kernel(allocates=False)
+def take(halo, margin, x, y, z, r, most, poses_too, votes, poses):  # type: ignore[no-untyped-def]
     """Copy what lies within r (Chebyshev, at most `margin`) of the voxel x, y, z of the block to
-    out (LISTS, > most), the high halves of the observables if `poses_too`. Returns how many."""
+    votes (>= COLUMNS, >= most + LANES), and to poses (most,) if `poses_too`. Returns how many; what
+    lies behind them means nothing."""
     edge = BLOCK + 2 * margin
-    words, poses, places = halo.listed[0], halo.listed[1], halo.listed[2]
-    out_words, out_poses, out_places = out[0], out[1], out[2]
-    low = np.uint64(x + margin - r)
+    low, first_y = np.uint64(x + margin - r), y + margin - r
     cube = (np.uint64(1) << np.uint64(2 * r + 1)) - np.uint64(1)
     before = (np.uint64(1) << low) - np.uint64(1)
     count = 0
     for k in range(z + margin - r, z + margin + r + 1):
-        for line in range(k * edge + y + margin - r, k * edge + y + margin + r + 1):
-            row = (halo.rows[line] >> low) & cube
-            if row == np.uint64(0):
-                continue
-            start = halo.first[line] + np.int64(population(halo.rows[line] & before))
-            end = start + np.int64(population(row))
-            if count + end - start > most:
+        filled = (halo.filled[k] >> np.uint64(first_y)) & cube
+        while filled != np.uint64(0):
+            line = k * edge + first_y + np.int64(trailing_zeros(filled))
+            filled &= filled - np.uint64(1)
+            row = halo.rows[line]
+            start = halo.first[line] + np.int64(population(row & before))
+            number = np.int64(population((row >> low) & cube))
+            if count + number > most:
                 return count
+            _copy(halo.votes, start, votes, count)  # mostly all, without asking
+            for i in range(LANES, number, LANES):
+                _copy(halo.votes, start + i, votes, count + i)
             if poses_too:
-                for i in range(start, end):
-                    out_poses[count + i - start] = poses[i]
-            for i in range(start, end):
-                out_words[count] = words[i]
-                out_places[count] = places[i]
-                count += 1
+                for i in range(number):
+                    poses[count + i] = halo.poses[start + i]
+            count += number
     return count
+
+
+@kernel(allocates=False, inlined=True)
+def _copy(source, start, target, at):  # type: ignore[no-untyped-def]
+    """Copy LANES votes."""
+    for c in range(COLUMNS):
+        store(target[c], at, load(source[c], start))

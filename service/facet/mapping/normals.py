@@ -21,7 +21,7 @@ from facet.mapping.adaptive import (
     make_rule,
 )
 from facet.mapping.blocks import list_voxels
-from facet.mapping.halo import Halo, gather, make_halos
+from facet.mapping.halo import gather, halo_of, make_halos
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory, grow_all
 from facet.mapping.principal import analyse_all
@@ -77,14 +77,13 @@ def _write(normals, rows, count, found):  # type: ignore[no-untyped-def]
 @kernel(allocates=False)
 def _estimate_block(  # type: ignore[no-untyped-def]
     blocks, observable, normals, block, stale, dirty, num_changes, rule, halo, traces, share,
-    scratch, found
+    scratch
 ):  # fmt: skip
     """Estimate the voxels of a block whose bit is set in stale (8,). Whether any changed. Its halo
     is gathered when the first of them asks for it, and again, wider, when one looks farther.
 
-    dirty (8,): bits of its dirty voxels; num_changes: dirty voxels round it, -1: too many;
-    found (512, 7): room."""
-    kept, principal, state, listed = scratch[2], scratch[3], scratch[4], scratch[6]
+    dirty (8,): bits of its dirty voxels; num_changes: dirty voxels round it, -1: too many."""
+    state, listed, found = scratch.state, scratch.listed, scratch.found
     rows, places, words, starts = listed[0], listed[1], listed[2], listed[3]
     number = list_voxels(blocks, block, stale, rows, places)
     for v in range(number):
@@ -103,7 +102,7 @@ def _estimate_block(  # type: ignore[no-untyped-def]
             one_line = seen >> 32 != 0  # asks for more than sums
             if is_whole and not (is_other or one_line):
                 continue
-            analyse_all(kept, state[KNOWN], rule.floor2, principal)
+            analyse_all(scratch.kept, state[KNOWN], rule.floor2, scratch.principal)
         kind = WIDER
         while kind == WIDER:
             at = halo, margin, local, seen, rule
@@ -144,26 +143,25 @@ def _refresh(  # type: ignore[no-untyped-def]
     block always falls to the same share: the traces of its voxels lie there."""
     for turn in prange(halos.rows.shape[0]):
         share = dealt(turn, halos.rows.shape[0])
-        halo = Halo(halos.listed[share], halos.rows[share], halos.first[share], halos.near[share])
-        scratch = make_scratch()
-        stale, found = np.zeros(8, np.uint64), np.zeros((512, 7), np.int16)
+        halo = halo_of(halos, share)
+        scratch, stale = make_scratch(), np.zeros(8, np.uint64)
         for q in range(which.shape[0]):
             block = which[q]
             if (block // RUN) % halos.rows.shape[0] != share:
                 continue
             counts[q] = find_stale(
                 blocks, dirty, normals.reach, block, deepest[1 + block], rule.start,
-                halo.near, halo.rows, scratch[6], stale,
+                halo.near, halo.rows, scratch.listed, stale,
             )  # fmt: skip
             turned[q] = False
             if counts[q] > 0:
                 blocks_out = (max(rule.start, deepest[1 + block]) + 7) >> 3
-                num = list_changes(blocks, columns, changes, halo.near, blocks_out, scratch[5])
+                num = list_changes(blocks, columns, changes, halo.near, blocks_out, scratch.changes)
                 turned[q] = _estimate_block(
                     blocks, columns.observable, normals, block, stale, dirty[block], num, rule,
-                    halo, traces, share, scratch, found,
+                    halo, traces, share, scratch,
                 )  # fmt: skip
-                deepest[1 + block] = _deepest(blocks, normals.reach, block, scratch[6])
+                deepest[1 + block] = _deepest(blocks, normals.reach, block, scratch.listed)
 
 
 class NormalField:

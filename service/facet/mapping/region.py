@@ -1,148 +1,136 @@
 """The votes of a cubic region, and their sums. What these say: `principal`.
 
-Votes are unpacked once, to columns of 32-bit integers with what decides whether they count; every
-radius, side and slab is then one pass over these short columns, eight votes at a time in vector
-registers. All sums are integers, so their order never matters.
+Votes lie in short columns of 16-bit integers, with what decides whether they count; every radius,
+side and slab is one pass over these, sixteen votes at a time. All sums are integers, so their order
+never matters.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
+from facet.mapping.halo import IN_X
 from facet.mapping.kernel import kernel
+from facet.mapping.lanes import LANES, add_products, larger, load, no_sums, splat, store, total
 
 MOST = 8192  # votes of a region that are looked at: w x x of so many stay below 2^31
-COLUMNS = 9  # x, y, z (1/8 voxel from the voxel's corner), weight, view x, y, z, distance,
-# seen from the side of the voxel (1, 0)
+FACED = 9  # columns of votes as a voxel sees them: centroids from its corner, 1/8 voxels; weights;
+# views; -1 where these are of its side, else 0; how far it is to their voxels (Chebyshev)
+X, Y, Z, WEIGHT, VIEW_X, VIEW_Y, VIEW_Z, SIDE, DISTANCE = range(FACED)
+BEYOND = 127  # a distance farther than any
 SUMS = 11  # number, weight, w x, y, z, w xx, xy, xz, yy, yz, zz
 
 
 @kernel(allocates=False)
-def decode(lists, count, seen, x0, y0, z0, votes):  # type: ignore[no-untyped-def]
-    """Unpack what was listed round a voxel at packed place (x0, y0, z0) with observable `seen` into
-    votes (COLUMNS, MOST) int32. A vote is of the voxel's side where their views differ by less than
-    120 degrees; where the voxel itself was seen from opposite sides, every vote is, until a normal
-    is known."""
-    words, places = lists[0], lists[2]
-    vx = np.int32(((seen >> 16) & 31) - 8)
-    vy = np.int32(((seen >> 21) & 31) - 8)
-    vz = np.int32(((seen >> 26) & 31) - 8)
-    length2 = np.int32(vx * vx + vy * vy + vz * vz)
-    any_side = np.int32((seen >> 31) & 1)
-    x, y, z, w = votes[0], votes[1], votes[2], votes[3]
-    view_x, view_y, view_z = votes[4], votes[5], votes[6]
-    distance, side = votes[7], votes[8]
-    for i in range(count):  # few columns a loop: the compiler must see that they do not overlap
-        word, place = words[i], places[i]
-        x[i] = 8 * ((place & 255) - x0) + (word & 15)
-        y[i] = 8 * (((place >> 8) & 255) - y0) + ((word >> 4) & 15)
-    for i in range(count):
-        word, place = words[i], places[i]
-        z[i] = 8 * ((place >> 16) - z0) + ((word >> 8) & 15)
-        w[i] = (word >> 12) & 15
-    for i in range(count):
-        place = places[i]
-        dx = np.int32((place & 255) - x0)
-        dy = np.int32(((place >> 8) & 255) - y0)
-        dz = np.int32((place >> 16) - z0)
-        distance[i] = max(abs(dx), abs(dy), abs(dz))
-    for i in range(count):
-        word = words[i]
-        view_x[i] = ((word >> 16) & 31) - 8
-        view_y[i] = ((word >> 21) & 31) - 8
-    for i in range(count):
-        view_z[i] = ((words[i] >> 26) & 31) - 8
-        side[i] = any_side | _is_near(vx, vy, vz, length2, words[i])
+def face(votes, count, seen, i0, j0, k0):  # type: ignore[no-untyped-def]
+    """See votes (FACED, >= count + LANES), listed round a voxel at place (i0, j0, k0) in its halo,
+    as that voxel does: what was listed gives way.
 
-
-@kernel(allocates=False)
-def _is_near(vx, vy, vz, length2, word):  # type: ignore[no-untyped-def]
-    """Whether (1, 0) the view of a vote, that was seen from one side, is near a view."""
-    ox = np.int32(((word >> 16) & 31) - 8)
-    oy = np.int32(((word >> 21) & 31) - 8)
-    oz = np.int32(((word >> 26) & 31) - 8)
-    dot = np.int32(min(0, np.int32(vx * ox + vy * oy + vz * oz)))
-    near = np.int32(4 * dot * dot) <= np.int32(length2 * np.int32(ox * ox + oy * oy + oz * oz))
-    return np.int32(near) & ((word >> 31) + 1)
+    seen: its observable. A vote is of its side where their views differ by less than 120 degrees;
+    where the voxel itself was seen from opposite sides, every vote is, until a normal is known."""
+    vx, vy, vz = ((seen >> 16) & 31) - 8, ((seen >> 21) & 31) - 8, ((seen >> 26) & 31) - 8
+    length2, any_side = vx * vx + vy * vy + vz * vz, splat(-((seen >> 31) & 1))
+    for i in range(0, count, LANES):
+        x, y, z, view = load(votes[0], i), load(votes[1], i), load(votes[2], i), load(votes[3], i)
+        store(votes[WEIGHT], i, x >> IN_X)
+        x = x & ((1 << IN_X) - 1)
+        i_place, j_place, k_place = x >> 4, y >> 4, z >> 4
+        di, dj, dk = i_place - i0, j_place - j0, k_place - k0
+        store(votes[DISTANCE], i, larger(larger(abs(di), abs(dj)), abs(dk)))
+        store(votes[X], i, x - i_place * 8 - 8 * i0)
+        store(votes[Y], i, y - j_place * 8 - 8 * j0)
+        store(votes[Z], i, z - k_place * 8 - 8 * k0)
+        ox, oy, oz = (view & 31) - 8, ((view >> 5) & 31) - 8, ((view >> 10) & 31) - 8
+        store(votes[VIEW_X], i, ox)
+        store(votes[VIEW_Y], i, oy)
+        store(votes[VIEW_Z], i, oz)
+        dot = ox * vx + oy * vy + oz * vz  # views are at most as long as (7, 7, 7)
+        near = (dot >= 0) | (dot * dot <= ((ox * ox + oy * oy + oz * oz) * length2 >> 2))
+        store(votes[SIDE], i, any_side | (near & (view >= 0)))
+    store(votes[DISTANCE], count, splat(BEYOND))  # of what lies behind the last
 
 
 @kernel(allocates=False)
 def is_beside(seen, word):  # type: ignore[no-untyped-def]
-    """Whether a vote is of the side of the voxel with observable `seen`, as `decode` says."""
+    """Whether a vote is of the side of the voxel with observable `seen`, as `face` says."""
     if (seen >> 31) & 1 == 1:
         return True
-    vx = np.int32(((seen >> 16) & 31) - 8)
-    vy = np.int32(((seen >> 21) & 31) - 8)
-    vz = np.int32(((seen >> 26) & 31) - 8)
-    return _is_near(vx, vy, vz, np.int32(vx * vx + vy * vy + vz * vz), np.int32(word)) == 1
+    vx, vy, vz = ((seen >> 16) & 31) - 8, ((seen >> 21) & 31) - 8, ((seen >> 26) & 31) - 8
+    ox, oy, oz = ((word >> 16) & 31) - 8, ((word >> 21) & 31) - 8, ((word >> 26) & 31) - 8
+    dot = min(0, vx * ox + vy * oy + vz * oz)
+    near = 4 * dot * dot <= (vx * vx + vy * vy + vz * vz) * (ox * ox + oy * oy + oz * oz)
+    return near and (word >> 31) & 1 == 0
 
 
 @kernel(allocates=False)
-def within(votes, count, r, sums):  # type: ignore[no-untyped-def]
-    """Sums of the votes of the voxel's side within r."""
-    x, y, z, w, distance, side = votes[0], votes[1], votes[2], votes[3], votes[7], votes[8]
-    zero = np.int32(0)
-    number, weight, sx, sy, sz = zero, zero, zero, zero, zero
-    sxx, sxy, sxz, syy, syz, szz = zero, zero, zero, zero, zero, zero
-    for i in range(count):
-        one = np.int32(side[i] if distance[i] <= r else zero)
-        number = np.int32(number + one)
-        wi = np.int32(w[i] * one)
-        weight = np.int32(weight + wi)
-        wx, wy, wz = np.int32(wi * x[i]), np.int32(wi * y[i]), np.int32(wi * z[i])
-        sx, sy, sz = np.int32(sx + wx), np.int32(sy + wy), np.int32(sz + wz)
-        sxx = np.int32(sxx + np.int32(wx * x[i]))
-        sxy = np.int32(sxy + np.int32(wx * y[i]))
-        sxz = np.int32(sxz + np.int32(wx * z[i]))
-        syy = np.int32(syy + np.int32(wy * y[i]))
-        syz = np.int32(syz + np.int32(wy * z[i]))
-        szz = np.int32(szz + np.int32(wz * z[i]))
-    sums[0], sums[1], sums[2], sums[3], sums[4] = number, weight, sx, sy, sz
-    sums[5], sums[6], sums[7], sums[8], sums[9], sums[10] = sxx, sxy, sxz, syy, syz, szz
-
-
-@kernel(allocates=False)
-def is_one_pose(lists, votes, count, r):  # type: ignore[no-untyped-def]
+def is_one_pose(votes, poses, count, r):  # type: ignore[no-untyped-def]
     """Whether all votes of the voxel's side within r come from one known line-scan pose."""
-    poses, distance, side = lists[1], votes[7], votes[8]
     known = np.int32(0)
     for i in range(count):
-        if side[i] == 1 and distance[i] <= r:
+        if votes[SIDE, i] != 0 and votes[DISTANCE, i] <= r:
             if poses[i] == 0 or (known != 0 and poses[i] != known):
                 return False
             known = poses[i]
     return known != 0
 
 
+@kernel(allocates=False, inlined=True)
+def _add(sums, counts, votes, i):  # type: ignore[no-untyped-def]
+    """Sums, and those of votes i .. i + LANES that count."""
+    number, weight, sx, sy, sz, xx, xy, xz, yy, yz, zz = sums
+    one, w = splat(1), load(votes[WEIGHT], i) & counts
+    x, y, z = load(votes[X], i), load(votes[Y], i), load(votes[Z], i)
+    wx, wy, wz = w * x, w * y, w * z
+    return (
+        add_products(number, one & counts, one),
+        add_products(weight, w, one),
+        add_products(sx, wx, one),
+        add_products(sy, wy, one),
+        add_products(sz, wz, one),
+        add_products(xx, wx, x),
+        add_products(xy, wx, y),
+        add_products(xz, wx, z),
+        add_products(yy, wy, y),
+        add_products(yz, wy, z),
+        add_products(zz, wz, z),
+    )
+
+
 @kernel(allocates=False)
-def within_slab(votes, count, r, nx, ny, nz, own, half, sums):  # type: ignore[no-untyped-def]
-    """Sums of the votes within r that were seen from the side of the normal, whole numbers, and
-    whose centroid lies within `half` of n . c = own."""
-    x, y, z, w, distance = votes[0], votes[1], votes[2], votes[3], votes[7]
-    view_x, view_y, view_z = votes[4], votes[5], votes[6]
-    fx, fy, fz = np.float32(nx), np.float32(ny), np.float32(nz)
-    middle, farthest = np.float32(own), np.float32(half)  # whole numbers, all below 2^24
-    nothing = np.float32(0.0)
-    zero, unit = np.int32(0), np.int32(1)
-    number, weight, sx, sy, sz = zero, zero, zero, zero, zero
-    sxx, sxy, sxz, syy, syz, szz = zero, zero, zero, zero, zero, zero
-    for i in range(count):
-        off = fx * np.float32(x[i]) + fy * np.float32(y[i]) + fz * np.float32(z[i]) - middle
-        towards = (
-            fx * np.float32(view_x[i]) + fy * np.float32(view_y[i]) + fz * np.float32(view_z[i])
-        )
-        inside = (distance[i] <= r) & (abs(off) < farthest) & (towards > nothing)
-        one = unit if inside else zero
-        number = np.int32(number + one)
-        wi = np.int32(w[i] * one)
-        weight = np.int32(weight + wi)
-        wx, wy, wz = np.int32(wi * x[i]), np.int32(wi * y[i]), np.int32(wi * z[i])
-        sx, sy, sz = np.int32(sx + wx), np.int32(sy + wy), np.int32(sz + wz)
-        sxx = np.int32(sxx + np.int32(wx * x[i]))
-        sxy = np.int32(sxy + np.int32(wx * y[i]))
-        sxz = np.int32(sxz + np.int32(wx * z[i]))
-        syy = np.int32(syy + np.int32(wy * y[i]))
-        syz = np.int32(syz + np.int32(wy * z[i]))
-        szz = np.int32(szz + np.int32(wz * z[i]))
-    sums[0], sums[1], sums[2], sums[3], sums[4] = number, weight, sx, sy, sz
-    sums[5], sums[6], sums[7], sums[8], sums[9], sums[10] = sxx, sxy, sxz, syy, syz, szz
+def within(votes, count, r, out):  # type: ignore[no-untyped-def]
+    """Sums (SUMS,) of the votes of the voxel's side within r."""
+    sums = _nothing()
+    for i in range(0, count, LANES):
+        sums = _add(sums, (load(votes[DISTANCE], i) <= r) & load(votes[SIDE], i), votes, i)
+    _write(sums, out)
+
+
+@kernel(allocates=False)
+def within_slab(votes, count, r, nx, ny, nz, own, half, out):  # type: ignore[no-untyped-def]
+    """Sums (SUMS,) of the votes within r that were seen from the side of the normal, whole numbers,
+    and whose centroid lies within `half` of n . c = own."""
+    sums, most = _nothing(), min(np.int64(np.ceil(half)), 32767)  # n . c - own is a whole number
+    for i in range(0, count, LANES):
+        off = load(votes[X], i) * nx + load(votes[Y], i) * ny + load(votes[Z], i) * nz - own
+        view = load(votes[VIEW_X], i), load(votes[VIEW_Y], i), load(votes[VIEW_Z], i)
+        towards = view[0] * nx + view[1] * ny + view[2] * nz
+        near = (load(votes[DISTANCE], i) <= r) & (abs(off) < most)
+        sums = _add(sums, near & (towards > 0), votes, i)
+    _write(sums, out)
+
+
+@kernel(allocates=False, inlined=True)
+def _nothing():  # type: ignore[no-untyped-def]
+    """SUMS of no votes."""
+    none = no_sums()
+    return none, none, none, none, none, none, none, none, none, none, none
+
+
+@kernel(allocates=False, inlined=True)
+def _write(sums, out):  # type: ignore[no-untyped-def]
+    number, weight, sx, sy, sz, xx, xy, xz, yy, yz, zz = sums
+    out[0], out[1], out[2], out[3], out[4] = (
+        total(number), total(weight), total(sx), total(sy), total(sz)
+    )  # fmt: skip
+    out[5], out[6], out[7] = total(xx), total(xy), total(xz)
+    out[8], out[9], out[10] = total(yy), total(yz), total(zz)

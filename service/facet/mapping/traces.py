@@ -14,10 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from facet.mapping.halo import LISTS, take
+from facet.mapping.halo import take
 from facet.mapping.kernel import kernel
+from facet.mapping.lanes import LANES
 from facet.mapping.principal import PLACES, analyse, make_principal
-from facet.mapping.region import COLUMNS, MOST, SUMS, decode, is_beside, within, within_slab
+from facet.mapping.region import FACED, MOST, SUMS, face, is_beside, within, within_slab
 
 SLAB_UNIT = 64  # the normal across a slab is rounded: these integers are a unit vector times this
 CUBE, SLAB, THIN_SLAB = range(3)  # what a key asks for
@@ -55,18 +56,32 @@ def make_traces(shares: int) -> Traces:
     )
 
 
+class Scratch(NamedTuple):
+    """What a thread needs to estimate voxels."""
+
+    votes: NDArray[np.int16]  # (FACED, > MOST) round a voxel
+    poses: NDArray[np.int32]  # (MOST,) likewise
+    kept: NDArray[np.int32]  # (PLACES, KEY + 1) sums at hand, each with its key
+    principal: NDArray[np.float64]  # what these say
+    state: NDArray[np.int64]  # KNOWN .. WHOLE
+    changes: NDArray[np.int64]  # (5, MOST_CHANGES) dirty voxels round a block: x, y, z from its
+    # corner, observable before and now
+    listed: NDArray[np.int64]  # (4, 512) voxels of the block
+    found: NDArray[np.int16]  # (512, 7) what was estimated of them
+
+
 @kernel
 def make_scratch():  # type: ignore[no-untyped-def]
-    """What a thread needs to estimate voxels."""
-    return (
-        np.empty((LISTS, MOST + 16), np.int32),  # 16: columns start on different cache sets
-        np.empty((COLUMNS, MOST + 16), np.int32),  # votes
-        np.zeros((PLACES, KEY + 1), np.int32),  # sums at hand, each with its key
-        make_principal(),  # what these say
-        np.zeros(5, np.int64),  # KNOWN .. WHOLE
-        np.zeros((5, MOST_CHANGES), np.int64),  # dirty voxels round a block: x, y, z from its
-        # corner, observable before and now
-        np.zeros((4, 512), np.int64),  # voxels of the block
+    """Room for one thread."""
+    return Scratch(
+        np.empty((FACED, MOST + 5 * LANES), np.int16),  # columns start on different cache sets
+        np.empty(MOST, np.int32),
+        np.zeros((PLACES, KEY + 1), np.int32),
+        make_principal(),
+        np.zeros(5, np.int64),
+        np.zeros((5, MOST_CHANGES), np.int64),
+        np.zeros((4, 512), np.int64),
+        np.zeros((512, 7), np.int16),
     )
 
 
@@ -91,14 +106,14 @@ def _read_key(key):  # type: ignore[no-untyped-def]
 def list_votes(at, reach, scratch):  # type: ignore[no-untyped-def]
     """List the votes within reach. Whether the halo is wide enough."""
     halo, margin, local, seen, _ = at
-    lists, votes, state = scratch[0], scratch[1], scratch[4]
+    votes, state = scratch.votes, scratch.state
     if state[LISTED] >= reach:
         return True
     if reach > margin:
         return False
     x, y, z = local & 7, (local >> 3) & 7, local >> 6
-    count = take(halo, margin, x, y, z, reach, MOST, seen >> 32 != 0, lists)
-    decode(lists, count, seen, x + margin, y + margin, z + margin, votes)
+    count = take(halo, margin, x, y, z, reach, MOST, seen >> 32 != 0, votes, scratch.poses)
+    face(votes, count, seen, x + margin, y + margin, z + margin)
     state[LISTED], state[COUNT] = reach, count
     return True
 
@@ -110,7 +125,7 @@ def ask(at, key, reach, scratch):  # type: ignore[no-untyped-def]
 
     at: halo, its margin, the voxel's place in the block, its observable, rule; reach: the largest
     radius that was asked for, up to which votes are listed."""
-    _, votes, kept, principal, state, _, _ = scratch
+    votes, kept, state = scratch.votes, scratch.kept, scratch.state
     for e in range(state[KNOWN]):
         if kept[e, KEY] == key:
             state[USED] |= 1 << e
@@ -127,7 +142,7 @@ def ask(at, key, reach, scratch):  # type: ignore[no-untyped-def]
         own = ix * (seen & 15) + iy * ((seen >> 4) & 15) + iz * ((seen >> 8) & 15)
         half = rule.slab if kind == SLAB else rule.thin_slab
         within_slab(votes, state[COUNT], r, ix, iy, iz, own, half, kept[e])
-    analyse(kept, e, rule.floor2, principal)
+    analyse(kept, e, rule.floor2, scratch.principal)
     return e
 
 
@@ -180,7 +195,7 @@ def find_records(traces, share, rows, count, starts):  # type: ignore[no-untyped
 def recall(traces, share, row, start, scratch):  # type: ignore[no-untyped-def]
     """Bring what is kept of a voxel, and began at `start`, to hand. Whether it is all that the last
     estimate asked for."""
-    kept, state = scratch[2], scratch[4]
+    kept, state = scratch.kept, scratch.state
     begin(state)
     if start < 0 or traces.entries[share, start, OWNER] != row + 1:  # overwritten by now
         return False
@@ -195,7 +210,7 @@ def recall(traces, share, row, start, scratch):  # type: ignore[no-untyped-def]
 @kernel(allocates=False)
 def keep(traces, share, row, scratch):  # type: ignore[no-untyped-def]
     """Keep those sums at hand that were asked for."""
-    kept, state = scratch[2], scratch[4]
+    kept, state = scratch.kept, scratch.state
     number = 0
     for e in range(state[KNOWN]):
         number += (state[USED] >> e) & 1
@@ -266,7 +281,7 @@ def list_changes(blocks, columns, dirty, near, blocks_out, changes):  # type: ig
 def amend(num_changes, local, seen, rule, scratch):  # type: ignore[no-untyped-def]
     """Bring the sums at hand from what the changed voxels were to what they are. Whether any sum is
     another now."""
-    kept, state, changes = scratch[2], scratch[4], scratch[5]
+    kept, state, changes = scratch.kept, scratch.state, scratch.changes
     farthest = 0
     for e in range(state[KNOWN]):
         farthest = max(farthest, kept[e, KEY] & 31)
