@@ -147,12 +147,16 @@ def test_passed_reads_the_counts() -> None:
     free = FreeSpace()
     scan = ticks_of((0, 0, 0), beams=[(40_000, 10, 20)])
     spots = np.array([(20_000, 100, 4000), (20_000, 5000, 20), (90_000, 10, 20), (-1, 10, 20)])
-    assert free.passed(spots, 1).tolist() == [False] * 4
+    assert free.passed_all(spots[None], 1) == 0
     for times in (1, 2, 3):
         free.insert(scan)
-        assert free.passed(spots, 3).tolist() == [times == 3, False, False, False]
+        passed = [free.passed_all(spot[None, None], 3) for spot in spots]
+        assert passed == [int(times == 3), 0, 0, 0]
+    through = (30_000, 75, 150), (10_000, 25, 50)
+    assert free.passed_all(np.array([[spots[0], spots[0]], through]), 3) == 2
+    assert free.passed_all(np.array([[spots[0], spots[1]], through]), 3) == 1  # of either column
     free.remove(scan)
-    assert not free.passed(spots, 3).any()
+    assert free.passed_all(spots[None], 3) == 0
 
 
 def test_growing_loses_nothing() -> None:

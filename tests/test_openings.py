@@ -45,7 +45,7 @@ def kind_of(free: FreeSpace, ring: np.ndarray) -> HoleKind:
 def test_probes_lie_before_on_and_behind_the_plane() -> None:
     found = probes(hole_at(1.5, 1.0, 1.0, 1.2), FRAME, INSIDE, OFFSET, SETTINGS)
     world = (found + 0.5) * SETTINGS.tick_m
-    before, on, behind = world.reshape(3, -1, 3)
+    before, on, behind = world
     step = CELL * SETTINGS.voxel_m
     for points, x in ((before, 2.03 - step), (on, 2.03), (behind, 2.03 + step)):
         np.testing.assert_allclose(points[:, 0], x, atol=1e-4)

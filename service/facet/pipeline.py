@@ -183,7 +183,6 @@ class Pipeline:
         held back: the last points, the last scene."""
         if self._apply(self._admission.finish(timeout_s)):
             self.update()
-        self._points_every_ns = min(self._points_every_ns, 1)
         self._emit(self._outgoing.finish(self.log_time_ns))
         self._send_points(None)
 

@@ -14,6 +14,7 @@ from facet.mapping.normals import ALIGNED, MIXED, SPARSE, THICK, VALID, Normals
 from facet.mapping.patches import Patches
 from facet.mapping.quantise import Ticks
 from facet.mapping.report import MapCounts
+from facet.mapping.settings import VOXELS
 from facet.mapping.store import VoxelStore
 from facet.mapping.tiles import TileField
 from facet_protocol.messages import Scan, TilePoints
@@ -81,7 +82,7 @@ class Census:
 
 @kernel
 def _fill(blocks, observable, label, id_of_patch, which, tile, centroids, ids):  # type: ignore[no-untyped-def]
-    rows, places = np.empty(512, np.int64), np.empty(512, np.int64)
+    rows, places = np.empty(VOXELS, np.int64), np.empty(VOXELS, np.int64)
     count = 0
     for q in range(which.shape[0]):
         block = which[q]

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from facet.mapping.blocks import CENTRE, Blocks, find, list_rows, pack, unpack
 from facet.mapping.kernel import kernel
 from facet.mapping.runs import dealt
+from facet.mapping.settings import VOXELS
 
 LEFTOVER_REACH = 8  # voxels between a leftover and the box of the patch it joins
 CLAIM_REACH = 2  # voxels between a corner voxel and the box of a patch that claims it too
@@ -67,7 +68,7 @@ def _make_scratch(per_block):  # type: ignore[no-untyped-def]
         np.empty((near, most), np.int16), np.empty(near, np.int64),
         np.empty(near, np.int64), np.empty(near), np.empty((125, 5), np.int64),
     )  # fmt: skip
-    v = np.empty((6, 512 + 16), np.int64)  # 16: columns start on different cache sets
+    v = np.empty((6, VOXELS + 16), np.int64)  # 16: columns start on different cache sets
     return found, Voxels(v[0], v[1], v[2], v[3], v[4], v[5])
 
 

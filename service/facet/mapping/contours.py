@@ -63,9 +63,25 @@ class Contour:
     rounded: UnitNormal
     frame: PlaneFrame
     shares: dict[Member, Share] = field(default_factory=dict)
+    drawn: dict[Place, set[Member]] = field(default_factory=dict)  # whose shares fall there
     cells: dict[Place, Cells] = field(default_factory=dict)
     edges: dict[Place, NDArray[np.int32]] = field(default_factory=dict)
     outlines: list[Outline] = field(default_factory=list)
+
+    def put(self, member: Member, share: Share) -> list[Place]:
+        """Take a share in. Returns where it falls."""
+        self.shares[member] = share
+        for place in share.places:
+            self.drawn.setdefault(place, set()).add(member)
+        return share.places
+
+    def drop(self, member: Member) -> list[Place]:
+        """Forget a share, if it is there. Returns where it fell."""
+        share = self.shares.pop(member, None)
+        places = share.places if share else []
+        for place in places:
+            self.drawn[place].remove(member)
+        return places
 
 
 class ContourField:
@@ -105,10 +121,8 @@ class ContourField:
             named = zip(ids, tile.stamps.tolist(), strict=False)
             stays = {(i, stamp): t for t, (i, stamp) in enumerate(named) if i}
             for plane_id, stamp in self._owners.get(key, set()) - stays.keys():
-                contour = self.contours.get(plane_id)
-                share = contour.shares.pop((key, stamp), None) if contour else None
-                if share is not None:
-                    stale[plane_id].update(share.places)
+                if plane_id in self.contours:
+                    stale[plane_id].update(self.contours[plane_id].drop((key, stamp)))
             self._owners[key] = set(stays)
             wanted.extend(
                 (plane_id, key, stamp, t)
@@ -117,8 +131,7 @@ class ContourField:
             )
         shares = self._shares(store, tiles, wanted)
         for (plane_id, key, stamp, _), share in zip(wanted, shares, strict=True):
-            self.contours[plane_id].shares[key, stamp] = share
-            stale[plane_id].update(share.places)
+            stale[plane_id].update(self.contours[plane_id].put((key, stamp), share))
         return self._redraw(stale)
 
     def _end(self, cuts: Cuts, stale: dict[int, set[Place]]) -> set[int]:
@@ -127,10 +140,8 @@ class ContourField:
         self._cuts = cuts
         for key, stamp in different:
             for plane_id, own in self._owners.get(key, set()):
-                contour = self.contours.get(plane_id) if own == stamp else None
-                share = contour.shares.pop((key, stamp), None) if contour else None
-                if share is not None:
-                    stale[plane_id].update(share.places)
+                if own == stamp and plane_id in self.contours:
+                    stale[plane_id].update(self.contours[plane_id].drop((key, stamp)))
         return {key for key, _ in different}
 
     def _reframe(
@@ -206,15 +217,12 @@ class ContourField:
     def _repaint(self, stale: list[Drawn]) -> dict[Drawn, NDArray[np.bool_]]:
         """Draw (u, v) tiles again from all shares. Returns the cells (CELLS, CELLS) whose edges may
         have changed by it, by plane id and tile."""
-        number = {drawn: n for n, drawn in enumerate(stale)}
-        held: list[Share] = []
-        drawn_by: list[list[int]] = [[] for _ in stale]
-        for plane_id in dict.fromkeys(plane_id for plane_id, _ in stale):
-            for share in self.contours[plane_id].shares.values():
-                on = [number[plane_id, p] for p in share.places if (plane_id, p) in number]
-                for n in on:
-                    drawn_by[n].append(len(held))
-                held.extend([share] if on else [])
+        number: dict[tuple[int, Member], int] = {}
+        drawn_by: list[list[int]] = []
+        for plane_id, place in stale:
+            members = self.contours[plane_id].drawn.get(place, ())
+            drawn_by.append([number.setdefault((plane_id, m), len(number)) for m in members])
+        held = [self.contours[plane_id].shares[member] for plane_id, member in number]
         old = [self.contours[plane_id].cells.pop(place, _NO_CELLS) for plane_id, place in stale]
         places = np.empty((len(stale), CELLS * CELLS), np.int16)
         words, counts = np.empty(places.shape, np.uint64), np.empty(len(stale), np.int64)

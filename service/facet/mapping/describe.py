@@ -147,6 +147,8 @@ class Describer:
 
     def _surface_ids(self, contour: Contour, old: _Entry | None) -> list[int]:
         """The nearest surface of the last description keeps its id, largest first."""
+        if old is not None and old.outlines is contour.outlines:
+            return [surface.id for surface in old.plane.surfaces]
         ids = [0] * len(contour.outlines)
         if old is not None:
             before = [(s.id, _centre(s.outer, old.plane.frame)) for s in old.plane.surfaces]

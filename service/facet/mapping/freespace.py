@@ -101,16 +101,23 @@ def _pass_all(table, counts, keys, num_blocks, sensor, points, start, every, sig
     return points.shape[0], num_blocks
 
 
-@kernel
-def passed(table_keys, table_values, counts, points, least):  # type: ignore[no-untyped-def]
-    """(N,) whether the cell of each point (N, 3) ticks was passed by at least `least` beams."""
-    out = np.zeros(points.shape[0], np.bool_)
-    for p in range(points.shape[0]):
-        i, j, k = points[p, 0] >> SHIFT, points[p, 1] >> SHIFT, points[p, 2] >> SHIFT
-        block = find(table_keys, table_values, pack(i >> 3, j >> 3, k >> 3))
-        if block >= 0:
-            out[p] = counts[block, (i & 7) + 8 * (j & 7) + 64 * (k & 7)] >= least
-    return out
+@kernel(allocates=False)
+def passed_all(table_keys, table_values, counts, points, least):  # type: ignore[no-untyped-def]
+    """In how many of N columns of points (M, N, 3) ticks every cell was passed by at least `least`
+    beams."""
+    number = 0
+    for n in range(points.shape[1]):
+        through = True
+        for m in range(points.shape[0]):
+            x, y, z = points[m, n]
+            i, j, k = x >> SHIFT, y >> SHIFT, z >> SHIFT
+            block = find(table_keys, table_values, pack(i >> 3, j >> 3, k >> 3))
+            local = (i & 7) + 8 * (j & 7) + 64 * (k & 7)
+            if block < 0 or counts[block, local] < least:
+                through = False
+                break
+        number += through
+    return number
 
 
 class FreeSpace:
@@ -147,9 +154,10 @@ class FreeSpace:
         """Take a scan's beams out again."""
         self._apply(ticks, -1)
 
-    def passed(self, points: Int64Array, least: int) -> NDArray[np.bool_]:
-        """(N,) whether at least `least` beams passed the cell of each point (N, 3) ticks, world."""
-        return np.asarray(passed(*self._table, self._counts, points, least))
+    def passed_all(self, points: Int64Array, least: int) -> int:
+        """In how many of N columns of points (M, N, 3) ticks, world, at least `least` beams passed
+        the cell of every one."""
+        return int(passed_all(*self._table, self._counts, points, least))
 
     def cells(self) -> tuple[Int64Array, NDArray[np.int32]]:
         """Keys (C,), ascending, and counts (C,) of the cells that were passed."""

@@ -249,16 +249,12 @@ class Mapper:
 
     def _heritage(self) -> Heritage:
         """Voxels that the planes of this update share with those of the last."""
-        old, plane, voxels = [], [], []
-        for index, key in enumerate(self._table.tile_keys.tolist()):
-            shared = self._tiles.tiles[key].heritage
-            label = self._planes.label[self._table.starts[index] + shared[:, 1]]
-            on = label != FREE
-            old.append(shared[on, 0])
-            plane.append(label[on])
-            voxels.append(shared[on, 2])
-        none = [np.zeros(0, np.int64)]
-        return Heritage(*(np.concatenate(none + part) for part in (old, plane, voxels)))
+        own = [self._tiles.tiles[key].heritage for key in self._table.tile_keys.tolist()]
+        old, tile_plane, voxels = np.concatenate([np.zeros((0, 3), np.int64), *own]).T
+        first = np.repeat(self._table.starts[:-1], [len(shared) for shared in own])
+        label = self._planes.label[first + tile_plane]
+        on = label != FREE
+        return Heritage(old[on], label[on], voxels[on])
 
     def _name(self, ids: NDArray[np.int64]) -> list[int]:
         """Hand the plane ids to the tiles. Returns the tiles that were renamed."""
@@ -277,17 +273,27 @@ class Mapper:
         again[self._seen_planes()] = True
         fitted = points.weight[again], points.centroid[again], points.scatter[again], unit[again]
         fits = iter(fit_planes(*fitted, self.settings.tick_m))
+        tiles = self._tiles_of(again)
         figures = {}
         for plane, plane_id in enumerate(ids.tolist()):
             if not again[plane]:
                 figures[plane_id] = told.figures[plane_id]
                 continue
-            own = np.unique(self._table.tile_of[planes.label == plane])
-            seen = self._witness.of(self._table.tile_keys[own].tolist())
             total, voxels = int(points.total[plane]), int(planes.occupation[plane])
+            seen = self._witness.of(tiles[plane])
             figures[plane_id] = Figures(next(fits), total, voxels, points.centroid[plane], seen)
         self._told = Told(ids, data, figures)
         return figures
+
+    def _tiles_of(self, wanted: NDArray[np.bool_]) -> dict[int, list[int]]:
+        """The tiles that planes lie in, of those that are wanted (K,), ascending."""
+        label, tile_of = self._planes.label, self._table.tile_of
+        on = np.flatnonzero(label != FREE)
+        on = on[wanted[label[on]]]
+        plane, tile = np.divmod(np.unique(label[on] << 32 | tile_of[on]), 1 << 32)
+        keys = self._table.tile_keys[tile].tolist()
+        ends = np.searchsorted(plane, np.arange(len(wanted) + 1)).tolist()
+        return {p: keys[ends[p] : ends[p + 1]] for p in np.flatnonzero(wanted).tolist()}
 
     def _seen_planes(self) -> NDArray[np.int64]:
         """Planes in tiles that were seen since the last update."""

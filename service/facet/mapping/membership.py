@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 from facet.mapping.bits import population
 from facet.mapping.blocks import CENTRE, list_voxels, unpack
 from facet.mapping.kernel import kernel
+from facet.mapping.settings import VOXELS
 
 SHELL = 1000  # places of blocks in a tile and in the shell round it
-VOXELS = 512  # of a block
 PURE, MIXED, CLAIMED = range(3)  # what a member is to its tile-plane
 COLLECT, LOOK, MOVED, TOUCHED = 1, 2, 4, 8  # flags of a block: labels, or tile-planes of patches,
 # changed; borders, claims or centroids; centroids; sums of points
@@ -73,8 +73,8 @@ class Chain(NamedTuple):
 
 @kernel(allocates=False)
 def _collect(blocks, patches, plane_of_patch, tile_key, block, listed, members):  # type: ignore[no-untyped-def]
-    """Voxels of a block whose patch, own or claiming, lies in the tile. How many. listed (4, 512):
-    room."""
+    """Voxels of a block whose patch, own or claiming, lies in the tile. How many. listed (4,
+    VOXELS): room."""
     rows, owner, claimed = members
     ti, tj, tk = unpack(tile_key)
     i, j, k = unpack(blocks.keys[block])

@@ -33,6 +33,24 @@ def _samples(ring, pitch):  # type: ignore[no-untyped-def]
     return out[:count]
 
 
+@kernel
+def _lift(uv, axis_u, axis_v, axis_n, normal, offset, step, tick):  # type: ignore[no-untyped-def]
+    """(3, N, 3) ticks: points (N, 2) of a frame, metres, a step before, on and behind the plane."""
+    out = np.empty((3, uv.shape[0], 3), np.int64)
+    flat = np.empty(3)
+    slope = axis_n[0] * normal[0] + axis_n[1] * normal[1] + axis_n[2] * normal[2]
+    for n in range(uv.shape[0]):
+        for a in range(3):
+            flat[a] = uv[n, 0] * axis_u[a] + uv[n, 1] * axis_v[a]
+        along = flat[0] * normal[0] + flat[1] * normal[1] + flat[2] * normal[2]
+        lift = (offset - along) / slope
+        for a in range(3):
+            on_plane = flat[a] + lift * axis_n[a]
+            for side in range(3):
+                out[side, n, a] = np.floor((on_plane + (1 - side) * (step * normal[a])) / tick)
+    return out
+
+
 def probes(
     ring: NDArray[np.int32],
     frame: PlaneFrame,
@@ -40,20 +58,16 @@ def probes(
     offset_m: float,
     settings: MapSettings,
 ) -> NDArray[np.int64]:
-    """(3 N, 3) ticks: samples of a hole before, on and behind the plane normal . x = offset_m."""
+    """(3, N, 3) ticks: samples of a hole before, on and behind the plane normal . x = offset_m."""
     uv = _samples(ring, PITCH) * frame.step_m
-    flat = uv[:, :1] * frame.axis_u + uv[:, 1:] * frame.axis_v
-    lift = (offset_m - flat @ normal) / float(frame.axis_n @ normal)
-    on_plane = flat + lift[:, None] * frame.axis_n
-    step = CELL * settings.voxel_m * normal
-    points = np.concatenate([on_plane + step, on_plane, on_plane - step])
-    return np.floor(points / (settings.voxel_m / TICKS)).astype(np.int64)
+    step_m, axes = CELL * settings.voxel_m, (frame.axis_u, frame.axis_v, frame.axis_n)
+    return np.asarray(_lift(uv, *axes, normal, offset_m, step_m, settings.voxel_m / TICKS))
 
 
 def hole_kind(probe: NDArray[np.int64], free: FreeSpace, settings: MapSettings) -> HoleKind:
     """OPENING where enough of the hole was passed before, on and behind the plane alike."""
-    if not len(probe):
+    number = probe.shape[1]
+    if not number:
         return HoleKind.UNOBSERVED
-    through = free.passed(probe, settings.passed_beams).reshape(3, -1).all(axis=0)
-    enough = float(through.mean()) >= settings.opening_share
+    enough = free.passed_all(probe, settings.passed_beams) / number >= settings.opening_share
     return HoleKind.OPENING if enough else HoleKind.UNOBSERVED

@@ -20,7 +20,7 @@ from facet.mapping.memory import Heap, Memory
 from facet.mapping.normals import VALID, Normals
 from facet.mapping.rungs import FIRST_RUNG, LIMITS, RUNG_STEP, RUNGS, read_rungs
 from facet.mapping.runs import SHARES, dealt
-from facet.mapping.settings import STEPS, MapSettings
+from facet.mapping.settings import STEPS, VOXELS, MapSettings
 from facet.mapping.staleness import find_dependents
 from facet.mapping.store import VoxelStore
 
@@ -104,7 +104,7 @@ def _group(blocks, observable, normals, patches, block, grouping, scratch):  # t
     centroid[:] = 0
     scatter[:] = 0
     unit[:] = 0
-    order = np.empty(512, np.int32)
+    order = np.empty(VOXELS, np.int32)
     num = 0
     for v in range(list_voxels(blocks, block, blocks.occupied[block], rows, places)):
         order[num] = (np.int32(normals.thickness[rows[v]]) << 9) | places[v]
@@ -207,9 +207,9 @@ def _group_some(  # type: ignore[no-untyped-def]
         np.zeros((PER_BLOCK, 6), np.int64),
         np.zeros((PER_BLOCK, 3), np.int64),
         np.zeros((PER_BLOCK, 6), np.int64),
-        np.zeros(512, np.int64),
-        np.zeros(512, np.int64),
-        np.zeros(512, np.int64),
+        np.zeros(VOXELS, np.int64),
+        np.zeros(VOXELS, np.int64),
+        np.zeros(VOXELS, np.int64),
     )
     for q in range(start, stop):
         count = _group(blocks, observable, normals, patches, which[q], grouping, scratch)

@@ -124,33 +124,30 @@ def _chains(follow):  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _split(chained, ends, keys):  # type: ignore[no-untyped-def]
+def _split(chained, ends, vertex):  # type: ignore[no-untyped-def]
     """Chains of edges (N,), each up to one of ends (C,), as rings of them that pass no vertex
-    twice, each from its smallest; keys: (E,) of the vertices that edges start from, ascending.
-    Signed areas add up to those of the chains. Rings of two edges are left out.
+    twice, each from its smallest; vertex: (E,) where edges start from, numbered in order. Signed
+    areas add up to those of the chains. Rings of two edges are left out.
 
     Returns their edges (M,), and where each ring ends (R,)."""
     edges, stops = np.empty(chained.shape[0], np.int64), np.empty(chained.shape[0], np.int64)
-    at = np.full(keys.shape[0], -1, np.int64)  # where on the path a vertex is
+    at = np.full(vertex.shape[0], -1, np.int64)  # where on the path a vertex is
     path = np.empty(chained.shape[0], np.int64)
     num, rings, begin = 0, 0, 0
     for c in range(ends.shape[0]):
         length = 0
         for n in range(begin, ends[c] + 1):
-            vertex = -1
-            if n < ends[c]:
-                vertex = np.searchsorted(keys, keys[chained[n]])
-            cut = 0 if vertex < 0 else at[vertex]
+            cut = 0 if n == ends[c] else at[vertex[chained[n]]]
             if cut >= 0:  # the path comes back to a vertex, or the chain ends
                 if length - cut > 2:
-                    num = _turn(path[cut:length], keys, edges, num)
+                    num = _turn(path[cut:length], vertex, edges, num)
                     stops[rings] = num
                     rings += 1
                 for p in range(cut, length):
-                    at[np.searchsorted(keys, keys[path[p]])] = -1
+                    at[vertex[path[p]]] = -1
                 length = cut
-            if vertex >= 0:
-                at[vertex] = length
+            if n < ends[c]:
+                at[vertex[chained[n]]] = length
                 path[length] = chained[n]
                 length += 1
         begin = ends[c]
@@ -158,11 +155,11 @@ def _split(chained, ends, keys):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _turn(path, keys, edges, num):  # type: ignore[no-untyped-def]
+def _turn(path, vertex, edges, num):  # type: ignore[no-untyped-def]
     """Append a ring to edges, from its smallest vertex on. Returns the number of edges."""
     first = 0
     for p in range(path.shape[0]):
-        if keys[path[p]] < keys[path[first]]:
+        if vertex[path[p]] < vertex[path[first]]:
             first = p
     for p in range(path.shape[0]):
         edges[num + p] = path[(first + p) % path.shape[0]]
@@ -184,10 +181,11 @@ def stitch(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     single = _single(start, stop, edges[order], ROW)
     edges, start, stop = edges[order[single]], start[single], stop[single]
     chained, ends = _chains(_successors(start, stop, edges))
-    chained, ends = _split(chained, ends, start)
+    vertex = np.cumsum(np.diff(start, prepend=start[:1]) > 0)
+    chained, ends = _split(chained, ends, vertex)
     vertices, begins = edges[chained, :2], starts_of(np.diff(ends, prepend=0))
     rings = [vertices[a:b] for a, b in zip(begins.tolist(), ends.tolist(), strict=False)]
-    by_first = np.argsort(start[chained[begins[:-1]]], kind="stable").tolist()
+    by_first = np.argsort(vertex[chained[begins[:-1]]], kind="stable").tolist()
     return [rings[n] for n in by_first]
 
 

@@ -15,6 +15,7 @@ from facet.mapping.blocks import CENTRE, Blocks, list_voxels
 from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.runs import SHARES, dealt
+from facet.mapping.settings import VOXELS
 from facet.mapping.sums import MOMENTS, SUMS, count_points, read_sums, shift_moments
 
 RUNGS = 40
@@ -27,8 +28,8 @@ PURE_SHARE = 4  # one point in so many must be pure for the rung to be read from
 
 @kernel(allocates=False)
 def _list_members(blocks, border, patches, block, members):  # type: ignore[no-untyped-def]
-    """List the voxels that go with a patch of their own block, as members (4, 512): row, place in
-    the block, patch, and whether they are pure: not at a border, and claimed by no plane at an
+    """List the voxels that go with a patch of their own block, as members (4, VOXELS): row, place
+    in the block, patch, and whether they are pure: not at a border, and claimed by no plane at an
     angle. How many."""
     rows, places, owners, are_pure = members[0], members[1], members[2], members[3]
     count = 0
@@ -78,7 +79,7 @@ def _read_some(blocks, columns, border, patches, which, start, stop, histogram):
     whole = np.empty((per_block, MOMENTS), np.int64)
     total = np.empty(per_block, np.int64)
     sums, spread = np.empty(SUMS, np.int64), np.empty(6)
-    members = np.empty((4, 512 + 16), np.int64)  # 16: columns start on different cache sets
+    members = np.empty((4, VOXELS + 16), np.int64)  # 16: columns start on different cache sets
     for q in range(start, stop):
         block = which[q]
         number = _list_members(blocks, border, patches, block, members)

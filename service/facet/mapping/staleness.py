@@ -31,6 +31,24 @@ def mark_dirty(columns, rows, dirty, first, following, out):  # type: ignore[no-
 
 
 @kernel(allocates=False)
+def _list_once(block, flags, out, count):  # type: ignore[no-untyped-def]
+    """List a block unless it is flagged, and flag it. Returns how many are listed."""
+    if not flags[block]:
+        flags[block] = True
+        out[count] = block
+        count += 1
+    return count
+
+
+@kernel(allocates=False)
+def _clear(flags, out, count):  # type: ignore[no-untyped-def]
+    """Take the flags back. Returns how many are listed."""
+    for q in range(count):
+        flags[out[q]] = False
+    return count
+
+
+@kernel(allocates=False)
 def find_candidates(blocks, deepest, sources, flags, out):  # type: ignore[no-untyped-def]
     """Blocks that look as far as one of the blocks `sources`, these included. deepest (1 + B,):
     the largest reach of all, then by block. Returns how many."""
@@ -53,20 +71,15 @@ def find_candidates(blocks, deepest, sources, flags, out):  # type: ignore[no-un
             else:
                 key = pack(bi + di, bj + dj, bk + dk)
                 target = np.int64(find(blocks.table_keys, blocks.table_values, key))
-            if target < 0 or flags[target] or (deepest[1 + target] < gap and target != sources[s]):
-                continue
-            flags[target] = True
-            out[count] = target
-            count += 1
-    for q in range(count):
-        flags[out[q]] = False
-    return count
+            if target >= 0 and (deepest[1 + target] >= gap or target == sources[s]):
+                count = _list_once(target, flags, out, count)
+    return _clear(flags, out, count)
 
 
 @kernel(allocates=False)
 def find_stale(blocks, dirty, reach, block, deepest, common, near, lines, listed, stale):  # type: ignore[no-untyped-def]
     """Set in stale (8,) the bits of a block's voxels that look at a dirty one, or are dirty
-    themselves. `common` is the reach that most voxels have; listed (3, 512): room. Returns how
+    themselves. `common` is the reach that most voxels have; listed (3, VOXELS): room. Returns how
     many."""
     margin = max(common, deepest)
     edge = BLOCK + 2 * margin
@@ -118,12 +131,6 @@ def find_dependents(blocks, far, which, flags, out):  # type: ignore[no-untyped-
         for n in range(125):
             di, dj, dk = n % 5 - 2, (n // 5) % 5 - 2, n // 25 - 2
             other = find(blocks.table_keys, blocks.table_values, pack(i + di, j + dj, k + dk))
-            if other < 0 or flags[other]:
-                continue
-            if max(abs(di), abs(dj), abs(dk)) < 2 or far[other]:
-                flags[other] = True
-                out[count] = other
-                count += 1
-    for q in range(count):
-        flags[out[q]] = False
-    return count
+            if other >= 0 and (max(abs(di), abs(dj), abs(dk)) < 2 or far[other]):
+                count = _list_once(other, flags, out, count)
+    return _clear(flags, out, count)

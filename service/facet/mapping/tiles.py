@@ -112,18 +112,19 @@ class TileField:
     ) -> list[int]:
         """Tell the tiles the plane ids (T,) of their tile-planes. Returns the tiles where they
         changed."""
-        renamed = []
-        for index, key in enumerate(tile_keys.tolist()):
-            tile = self.tiles[key]
-            own = ids[starts[index] : starts[index + 1]]
-            same = np.array_equal(own, tile.ids)
-            if same and tile.named:
-                continue
-            if not same:
-                renamed.append(key)
+        tiles = [self.tiles[key] for key in tile_keys.tolist()]
+        counts = np.diff(starts).tolist()
+        alike = [len(tile.ids) == count for tile, count in zip(tiles, counts, strict=True)]
+        none = np.full(max(counts, default=0), NO_PLANE)
+        before = [t.ids if a else none[:c] for t, a, c in zip(tiles, alike, counts, strict=True)]
+        differs = np.concatenate([none[:0], *before]) != ids
+        renamed = np.logical_or.reduceat(differs, starts[:-1]) if tiles else differs
+        named = np.array([tile.named for tile in tiles], np.bool_)
+        for index in np.flatnonzero(renamed | ~named).tolist():
+            tile, own = tiles[index], ids[starts[index] : starts[index + 1]]
             tile.ids, tile.named = own.copy(), True
             tile.heritage = np.stack([own, np.arange(len(own)), tile.occupation], axis=1)
-        return renamed
+        return [int(key) for key in tile_keys[renamed]]
 
     def renamed_abroad(self, store: VoxelStore, keys: set[int]) -> set[int]:
         """The tiles that hold voxels of these, whose voxels or plane ids changed, beyond them: as

@@ -19,6 +19,7 @@ from facet.mapping.kernel import kernel
 from facet.mapping.lanes import LANES
 from facet.mapping.principal import PLACES, analyse, make_principal
 from facet.mapping.region import FACED, MOST, SUMS, face, is_beside, within, within_slab
+from facet.mapping.settings import VOXELS
 
 SLAB_UNIT = 64  # the normal across a slab is rounded: these integers are a unit vector times this
 CUBE, SLAB, THIN_SLAB = range(3)  # what a key asks for
@@ -66,8 +67,8 @@ class Scratch(NamedTuple):
     state: NDArray[np.int64]  # KNOWN .. WHOLE
     changes: NDArray[np.int64]  # (5, MOST_CHANGES) dirty voxels round a block: x, y, z from its
     # corner, observable before and now
-    listed: NDArray[np.int64]  # (4, 512) voxels of the block
-    found: NDArray[np.int16]  # (512, 7) what was estimated of them
+    listed: NDArray[np.int64]  # (4, VOXELS) voxels of the block
+    found: NDArray[np.int16]  # (VOXELS, 7) what was estimated of them
 
 
 @kernel
@@ -80,8 +81,8 @@ def make_scratch():  # type: ignore[no-untyped-def]
         make_principal(),
         np.zeros(5, np.int64),
         np.zeros((5, MOST_CHANGES), np.int64),
-        np.zeros((4, 512), np.int64),
-        np.zeros((512, 7), np.int16),
+        np.zeros((4, VOXELS), np.int64),
+        np.zeros((VOXELS, 7), np.int16),
     )
 
 
