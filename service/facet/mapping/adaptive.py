@@ -9,8 +9,6 @@ eq. 16 approaches, without its dependence on the order of points (method.md 4.1,
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -34,70 +32,77 @@ EMPTY, VALID, ALIGNED, THICK, SPARSE, MIXED = range(6)
 WIDER = 255  # no class: the voxel must look farther than its halo
 UNIT = 256  # normals are integers: a unit vector times this
 OUTLIER = 6  # a voxel with so many times fewer points than those round it has no normal
+GROWTHS = 1024  # numbers of votes that eq. 19 is tabulated for: beyond n_max it is the same
 MIN_VOTES = 4  # fewer votes than this say nothing
 
 
-class Rule(NamedTuple):
-    """The method's constants as the kernel wants them."""
+RULE = np.dtype(  # the method's constants as the kernel wants them
+    [
+        ("sigma_target", np.float64),  # w_sigma * Lambda
+        ("w_sigma", np.float64),
+        ("w_points", np.float64),
+        ("growth", np.float64, (GROWTHS,)),  # R_N / R (eq. 19) by number of votes, clamped
+        ("floor2", np.float64),  # squared sigma floor, (1/8 voxel)^2
+        ("tan_theta", np.float64),
+        ("epsilon", np.float64),
+        ("offset", np.float64),  # 1/8 voxels, of a voxel from the plane of its own region
+        ("border", np.float64),  # 1/8 voxels per voxel of radius, in the plane, from the centroid
+        # of the region
+        ("slab", np.float64),  # 1/8 voxels / SLAB_UNIT, half width of the slab that votes in the
+        # second look
+        ("thin_slab", np.float64),  # likewise in the last look, where surfaces meet
+        ("thin_passes", np.int64),
+        ("thin_points", np.int64),
+        ("thin_share", np.int64),
+        ("tan_mixed", np.float64),
+        ("passes", np.int64),
+        ("shrink", np.int64),
+        ("least_first", np.int64),
+        ("start", np.int64),
+        ("largest", np.int64),
+        ("sparse", np.int64),
+        ("outlier", np.int64),
+    ],
+    align=True,
+)
 
-    sigma_target: float  # w_sigma * Lambda
-    w_sigma: float
-    w_points: float
-    growth: NDArray[np.float64]  # R_N / R (eq. 19) by number of votes, clamped
-    floor2: float  # squared sigma floor, (1/8 voxel)^2
-    tan_theta: float
-    epsilon: float
-    offset: float  # 1/8 voxels, of a voxel from the plane of its own region
-    border: float  # 1/8 voxels per voxel of radius, in the plane, from the centroid of the region
-    slab: float  # 1/8 voxels / SLAB_UNIT, half width of the slab that votes in the second look
-    thin_slab: float  # likewise in the last look, where surfaces meet
-    thin_passes: int
-    thin_points: int
-    thin_share: int
-    tan_mixed: float
-    passes: int
-    shrink: int
-    least_first: int
-    start: int
-    largest: int
-    sparse: int
-    outlier: int
 
-
-def make_rule(settings: MapSettings) -> Rule:
-    """Tabulate eq. 19-20; eq. 25 gives the weights from epsilon and Lambda."""
+def make_rule(settings: MapSettings) -> NDArray[np.void]:
+    """(1,) RULE: eq. 19-20 tabulated; eq. 25 gives the weights from epsilon and Lambda. Raises
+    ValueError for an n_max that the table has no room for."""
+    if settings.n_max >= GROWTHS:
+        raise ValueError(f"n_max = {settings.n_max} is over {GROWTHS - 1} votes")
     w_sigma = settings.gain * settings.epsilon / settings.lambda_target
-    counts = np.arange(4 * settings.n_max + 1)
+    counts = np.arange(GROWTHS)
     few = (settings.n_0 - counts) / (settings.n_0 - settings.n_min)
     many = -(counts - settings.n_0) / (settings.n_max - settings.n_0)
     alpha = np.clip(
         np.where(counts < settings.n_0, few, many), -settings.alpha_clip, settings.alpha_clip
     )
-    growth = settings.tan_base ** np.tan(settings.tan_slope * math.pi / 2 * alpha)
-    return Rule(
-        sigma_target=w_sigma * settings.lambda_target,
-        w_sigma=w_sigma,
-        w_points=settings.gain - w_sigma,
-        growth=growth,
-        floor2=(settings.sigma_floor * STEPS) ** 2,
-        tan_theta=math.tan(math.radians(settings.theta_deg)),
-        epsilon=settings.epsilon,
-        offset=settings.own_offset * STEPS,
-        border=settings.border * STEPS,
-        slab=settings.slab * STEPS * SLAB_UNIT,
-        thin_slab=settings.thin_slab * STEPS * SLAB_UNIT,
-        thin_passes=settings.thin_passes,
-        thin_points=settings.thin_points,
-        thin_share=settings.thin_share,
-        tan_mixed=math.tan(math.radians(settings.mixed_deg)),
-        passes=settings.passes,
-        shrink=settings.shrink,
-        least_first=settings.least_first,
-        start=settings.start_radius,
-        largest=settings.max_radius,
-        sparse=MIN_VOTES,
-        outlier=OUTLIER,
-    )
+    rule = np.recarray(1, RULE)
+    rule.sigma_target = w_sigma * settings.lambda_target
+    rule.w_sigma = w_sigma
+    rule.w_points = settings.gain - w_sigma
+    rule.growth = settings.tan_base ** np.tan(settings.tan_slope * math.pi / 2 * alpha)
+    rule.floor2 = (settings.sigma_floor * STEPS) ** 2
+    rule.tan_theta = math.tan(math.radians(settings.theta_deg))
+    rule.epsilon = settings.epsilon
+    rule.offset = settings.own_offset * STEPS
+    rule.border = settings.border * STEPS
+    rule.slab = settings.slab * STEPS * SLAB_UNIT
+    rule.thin_slab = settings.thin_slab * STEPS * SLAB_UNIT
+    rule.thin_passes = settings.thin_passes
+    rule.thin_points = settings.thin_points
+    rule.thin_share = settings.thin_share
+    rule.tan_mixed = math.tan(math.radians(settings.mixed_deg))
+    rule.passes = settings.passes
+    rule.shrink = settings.shrink
+    rule.least_first = settings.least_first
+    rule.start = settings.start_radius
+    rule.largest = settings.max_radius
+    rule.sparse = MIN_VOTES
+    rule.outlier = OUTLIER
+    return rule
 
 
 @kernel(allocates=False)

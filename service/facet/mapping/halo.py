@@ -7,8 +7,6 @@ runs of that list.
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -27,43 +25,24 @@ COLUMNS = 4  # 16-bit numbers listed of a voxel: x, y, z, view. x, y and z are 1
 IN_X = 10
 
 
-class Halo(NamedTuple):
-    """Scratch of one thread: the surroundings of one block at a time."""
-
-    votes: NDArray[np.int16]  # (COLUMNS, EDGE^3 + LANES) of the occupied voxels, x fastest
-    poses: NDArray[np.int32]  # (EDGE^3,) likewise, the high halves of their observables
-    words: NDArray[np.int32]  # (2, EDGE^3) likewise, the low halves; packed places
-    rows: NDArray[np.uint64]  # (EDGE^2,) a bit per x of the row (z, y), y fastest
-    first: NDArray[np.int32]  # (EDGE^2,) where the row starts in the list
-    filled: NDArray[np.uint64]  # (EDGE,) a bit per y of the rows at z: it holds a voxel
-    near: NDArray[np.int32]  # (SIDE_BLOCKS^3,) blocks, -1: none
-
-
-def make_halos(count: int) -> Halo:
-    """Scratch for `count` threads, stacked: 3 MB each, of which only what is used gets memory."""
-    return Halo(
-        np.empty((count, COLUMNS, EDGE**3 + LANES), np.int16),
-        np.empty((count, EDGE**3), np.int32),
-        np.empty((count, 2, EDGE**3), np.int32),
-        np.empty((count, EDGE**2), np.uint64),
-        np.empty((count, EDGE**2), np.int32),
-        np.empty((count, EDGE), np.uint64),
-        np.empty((count, SIDE_BLOCKS**3), np.int32),
-    )
+HALO = np.dtype(  # scratch of one thread: the surroundings of one block at a time
+    [
+        ("votes", np.int16, (COLUMNS, EDGE**3 + LANES)),  # of the occupied voxels, x fastest
+        ("poses", np.int32, (EDGE**3,)),  # likewise, the high halves of their observables
+        ("words", np.int32, (EDGE**3,)),  # likewise, the low halves
+        ("places", np.int32, (EDGE**3,)),  # likewise, packed
+        ("rows", np.uint64, (EDGE**2,)),  # a bit per x of the row (z, y), y fastest
+        ("first", np.int32, (EDGE**2,)),  # where the row starts in the list
+        ("filled", np.uint64, (EDGE,)),  # a bit per y of the rows at z: it holds a voxel
+        ("near", np.int32, (SIDE_BLOCKS**3,)),  # blocks, -1: none
+    ],
+    align=True,
+)
 
 
-@kernel
-def halo_of(halos, share):  # type: ignore[no-untyped-def]
-    """That of one thread."""
-    return Halo(
-        halos.votes[share],
-        halos.poses[share],
-        halos.words[share],
-        halos.rows[share],
-        halos.first[share],
-        halos.filled[share],
-        halos.near[share],
-    )
+def make_halos(count: int) -> NDArray[np.void]:
+    """(count,) HALO: 2.2 MB each, of which only what is used gets memory."""
+    return np.empty(count, HALO)
 
 
 @kernel(allocates=False)
@@ -117,7 +96,7 @@ def gather(blocks, observable, block, margin, halo):  # type: ignore[no-untyped-
     edge = BLOCK + 2 * margin
     find_near(blocks, block, blocks_out, halo.near)
     fill_rows(blocks.occupied, halo.near, blocks_out, margin, halo.rows)
-    words, poses, places = halo.words[0], halo.poses, halo.words[1]
+    words, poses, places = halo.words, halo.poses, halo.places
     halo.filled[:edge] = np.uint64(0)
     count = 0
     for line in range(edge * edge):

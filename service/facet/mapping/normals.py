@@ -21,7 +21,7 @@ from facet.mapping.adaptive import (
     make_rule,
 )
 from facet.mapping.blocks import list_voxels
-from facet.mapping.halo import gather, halo_of, make_halos
+from facet.mapping.halo import gather, make_halos
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory, grow_all
 from facet.mapping.principal import analyse_all
@@ -31,13 +31,13 @@ from facet.mapping.staleness import find_candidates, find_stale, mark_dirty
 from facet.mapping.store import Dirty, VoxelStore
 from facet.mapping.traces import (
     KNOWN,
+    SCRATCH,
     amend,
     begin,
     find_records,
     forget,
     keep,
     list_changes,
-    make_scratch,
     make_traces,
     recall,
 )
@@ -133,21 +133,22 @@ def _deepest(blocks, reach, block, listed):  # type: ignore[no-untyped-def]
 
 @kernel(parallel=True)
 def _refresh(  # type: ignore[no-untyped-def]
-    blocks, columns, normals, deepest, dirty, changes, which, rule, halos, traces, counts, turned
-):
+    blocks, columns, normals, deepest, dirty, changes, which, rules, halos, scratches, traces,
+    counts, turned,
+):  # fmt: skip
     """Estimate again what is stale in the blocks `which` (C,); counts (C,) says how many voxels,
     turned (C,) whether any of them changed. dirty: (B, 8) bits of dirty voxels; changes: these as
     rows, observables before, and lists by block (`mark_dirty`).
 
     Every voxel depends on observables alone and writes its own place: threads change nothing. A
     block always falls to the same share: the traces of its voxels lie there."""
-    for turn in prange(halos.rows.shape[0]):
-        share = dealt(turn, halos.rows.shape[0])
-        halo = halo_of(halos, share)
-        scratch, stale = make_scratch(), np.zeros(8, np.uint64)
+    for turn in prange(halos.shape[0]):
+        share = dealt(turn, halos.shape[0])
+        halo, scratch, rule = halos[share], scratches[share], rules[0]
+        stale = np.zeros(8, np.uint64)
         for q in range(which.shape[0]):
             block = which[q]
-            if (block // RUN) % halos.rows.shape[0] != share:
+            if (block // RUN) % halos.shape[0] != share:
                 continue
             counts[q] = find_stale(
                 blocks, dirty, normals.reach, block, deepest[1 + block], rule.start,
@@ -156,7 +157,9 @@ def _refresh(  # type: ignore[no-untyped-def]
             turned[q] = False
             if counts[q] > 0:
                 blocks_out = (max(rule.start, deepest[1 + block]) + 7) >> 3
-                num = list_changes(blocks, columns, changes, halo.near, blocks_out, scratch.changes)
+                num = list_changes(
+                    blocks, columns, dirty, changes, halo.near, blocks_out, scratch.changes
+                )
                 turned[q] = _estimate_block(
                     blocks, columns.observable, normals, block, stale, dirty[block], num, rule,
                     halo, traces, share, scratch,
@@ -182,7 +185,7 @@ class NormalField:
         self._dirty = np.zeros((0, 8), np.uint64)
         self._first = np.zeros(0, np.int32)  # dirty voxels by block, see mark_dirty
         self._flags = np.zeros(0, np.bool_)
-        self._halos = make_halos(SHARES)
+        self._halos, self._scratches = make_halos(SHARES), np.zeros(SHARES, SCRATCH)
         self._traces = make_traces(SHARES)
 
     def restore(self, store: VoxelStore, normals: Normals) -> None:
@@ -212,7 +215,7 @@ class NormalField:
         counts, turned = np.empty(len(which), np.int32), np.empty(len(which), np.bool_)
         _refresh(
             store.blocks, store.columns, self.normals, self._deepest, self._dirty, changes, which,
-            self._rule, self._halos, self._traces, counts, turned,
+            self._rule, self._halos, self._scratches, self._traces, counts, turned,
         )  # fmt: skip
         self._dirty[sources] = 0
         self._first[sources] = 0

@@ -15,12 +15,7 @@ LANES = 8  # sums side by side
 PLACES = 2 * LANES  # sums that there is room for
 LAMBDA, TAN_GAMMA, NX, NY, NZ, XX, YY, ZZ, XY, XZ, YZ = range(0, 11 * PLACES, PLACES)  # where what
 # they say, and their covariance, begins: one array, so that it is known that nothing overlaps
-
-
-@kernel
-def make_principal():  # type: ignore[no-untyped-def]
-    """Room for what PLACES sums say."""
-    return np.zeros(YZ + PLACES)
+PRINCIPAL = YZ + PLACES  # numbers of that array
 
 
 @kernel(allocates=False, inlined=True)

@@ -14,10 +14,11 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from facet.mapping.bits import population
 from facet.mapping.halo import take
 from facet.mapping.kernel import kernel
 from facet.mapping.lanes import LANES
-from facet.mapping.principal import PLACES, analyse, make_principal
+from facet.mapping.principal import PLACES, PRINCIPAL, analyse
 from facet.mapping.region import FACED, MOST, SUMS, face, is_beside, within, within_slab
 from facet.mapping.settings import VOXELS
 
@@ -57,33 +58,22 @@ def make_traces(shares: int) -> Traces:
     )
 
 
-class Scratch(NamedTuple):
-    """What a thread needs to estimate voxels."""
-
-    votes: NDArray[np.int16]  # (FACED, > MOST) round a voxel
-    poses: NDArray[np.int32]  # (MOST,) likewise
-    kept: NDArray[np.int32]  # (PLACES, KEY + 1) sums at hand, each with its key
-    principal: NDArray[np.float64]  # what these say
-    state: NDArray[np.int64]  # KNOWN .. WHOLE
-    changes: NDArray[np.int64]  # (5, MOST_CHANGES) dirty voxels round a block: x, y, z from its
-    # corner, observable before and now
-    listed: NDArray[np.int64]  # (4, VOXELS) voxels of the block
-    found: NDArray[np.int16]  # (VOXELS, 7) what was estimated of them
-
-
-@kernel
-def make_scratch():  # type: ignore[no-untyped-def]
-    """Room for one thread."""
-    return Scratch(
-        np.empty((FACED, MOST + 5 * LANES), np.int16),  # columns start on different cache sets
-        np.empty(MOST, np.int32),
-        np.zeros((PLACES, KEY + 1), np.int32),
-        make_principal(),
-        np.zeros(5, np.int64),
-        np.zeros((5, MOST_CHANGES), np.int64),
-        np.zeros((4, VOXELS), np.int64),
-        np.zeros((VOXELS, 7), np.int16),
-    )
+SCRATCH = np.dtype(  # what a thread needs to estimate voxels; a record goes from loop to loop as
+    # one address, its arrays by themselves as half a dozen numbers each
+    [
+        ("votes", np.int16, (FACED, MOST + 5 * LANES)),  # round a voxel; columns start on
+        # different cache sets
+        ("poses", np.int32, (MOST,)),  # likewise
+        ("kept", np.int32, (PLACES, KEY + 1)),  # sums at hand, each with its key
+        ("principal", np.float64, (PRINCIPAL,)),  # what these say
+        ("state", np.int64, (5,)),  # KNOWN .. WHOLE
+        ("changes", np.int64, (5, MOST_CHANGES)),  # dirty voxels round a block: x, y, z from its
+        # corner, observable before and now
+        ("listed", np.int64, (4, VOXELS)),  # voxels of the block
+        ("found", np.int16, (VOXELS, 7)),  # what was estimated of them
+    ],
+    align=True,
+)
 
 
 @kernel(allocates=False)
@@ -252,10 +242,18 @@ def forget(traces, share, row):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def list_changes(blocks, columns, dirty, near, blocks_out, changes):  # type: ignore[no-untyped-def]
-    """List the dirty voxels of the blocks `near`. How many, -1: too many."""
+def list_changes(blocks, columns, bits, dirty, near, blocks_out, changes):  # type: ignore[no-untyped-def]
+    """List the dirty voxels of the blocks `near`, whose bits are set in bits (B, 8). How many, -1:
+    too many."""
     rows, before, first, following = dirty
     width = 2 * blocks_out + 1
+    number = np.uint64(0)
+    for n in range(width * width * width):
+        if near[n] >= 0 and first[near[n]] > 0:
+            for z in range(8):
+                number += population(bits[near[n], z])
+    if number > np.uint64(MOST_CHANGES):
+        return -1
     count = 0
     for n in range(width * width * width):
         if near[n] < 0:
@@ -265,8 +263,6 @@ def list_changes(blocks, columns, dirty, near, blocks_out, changes):  # type: ig
         z0 = 8 * (n // (width * width) - blocks_out)
         d = first[near[n]]
         while d > 0:
-            if count == MOST_CHANGES:
-                return -1
             local = np.int64(columns.local[rows[d - 1]])
             changes[0, count] = x0 + (local & 7)
             changes[1, count] = y0 + ((local >> 3) & 7)
