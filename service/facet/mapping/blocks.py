@@ -100,7 +100,7 @@ class Blocks(NamedTuple):
     neighbours: NDArray[np.int32]  # (B, 27) at (dx+1) + 3 (dy+1) + 9 (dz+1), -1: none
 
 
-@kernel(allocates=False)
+@kernel(allocates=False, inlined=True)
 def row_at(blocks: Blocks, block: int, local: int) -> Any:
     """The row of a voxel at local index x + 8 y + 64 z of a block, or -1."""
     return blocks.rows[blocks.lines[block, local >> 3], local & 7] - 1

@@ -54,7 +54,7 @@ def carry(low, middle, high, flags, row):  # type: ignore[no-untyped-def]
             flags[row] |= DEEP
 
 
-@kernel(allocates=False)
+@kernel(allocates=False, inlined=True)
 def read_sums(columns, row, out):  # type: ignore[no-untyped-def]
     """The sums of a voxel (SUMS,)."""
     for s in range(SUMS):
@@ -77,7 +77,7 @@ def write_sums(columns, row, sums):  # type: ignore[no-untyped-def]
             columns.flags[row] |= DEEP
 
 
-@kernel(allocates=False)
+@kernel(allocates=False, inlined=True)
 def count_points(columns, row):  # type: ignore[no-untyped-def]
     """How many points a voxel holds."""
     n = np.int64(columns.low[row, 0]) + (np.int64(columns.middle[row, 0]) << LOW)
@@ -95,7 +95,7 @@ def sums_of(columns: Any, rows: NDArray[Any]) -> NDArray[np.int64]:
     return np.asarray(out)
 
 
-@kernel(allocates=False)
+@kernel(allocates=False, inlined=True)
 def shift_moments(own, x, y, z, total):  # type: ignore[no-untyped-def]
     """Add moments (10,) to `total`, about a corner that lies x, y, z voxels before their own."""
     n, dx, dy, dz = own[0], TICKS * x, TICKS * y, TICKS * z
