@@ -26,7 +26,7 @@ PAPER = MapSettings(
 @pytest.mark.parametrize(("epsilon", "ratio"), [(0.5, 19.0), (10 / 21, 20.0), (0.3, 97 / 3)])
 def test_weights_follow_from_epsilon(epsilon: float, ratio: float) -> None:
     """(25), method.md 10.3: epsilon = Lambda / (1 + w_N / w_sigma)."""
-    rule = make_rule(replace(PAPER, epsilon=epsilon))
+    (rule,) = make_rule(replace(PAPER, epsilon=epsilon))
     assert rule.w_points / rule.w_sigma == pytest.approx(ratio)
     assert 10.0 / (1.0 + rule.w_points / rule.w_sigma) == pytest.approx(epsilon)
     assert rule.sigma_target == pytest.approx(10.0 * rule.w_sigma)
@@ -34,7 +34,7 @@ def test_weights_follow_from_epsilon(epsilon: float, ratio: float) -> None:
 
 def test_growth_by_number_of_votes() -> None:
     """(19), method.md 10.4: alpha = 1 at n_MIN, 0 at n_0, -1 at n_MAX; clamped, and falling."""
-    growth = make_rule(PAPER).growth
+    growth = make_rule(PAPER)[0].growth
     assert growth[12] == pytest.approx(1.360768, abs=1e-6)
     assert growth[40] == pytest.approx(1.0, abs=1e-12)
     assert growth[120] == pytest.approx(0.734879, abs=1e-6)
@@ -54,7 +54,7 @@ def test_the_radius_settles_where_the_paper_says(
     gain: float, sigma: float, density: float, radius: float | None, votes: float
 ) -> None:
     """method.md 10.5: an ideal square patch; the sign of the step changes at the stated radius."""
-    rule = make_rule(replace(PAPER, gain=gain))
+    (rule,) = make_rule(replace(PAPER, gain=gain))
 
     def step(r: float) -> float:
         """R_next / R - 1 by (16) to (20)."""

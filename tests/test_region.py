@@ -6,33 +6,27 @@ from functools import cache
 
 import numpy as np
 import pytest
-from numba import njit
 from numpy.typing import NDArray
 
 from facet.mapping.adaptive import make_rule
 from facet.mapping.blocks import pack
-from facet.mapping.halo import WIDEST, Halo, gather, halo_of, make_halos
+from facet.mapping.halo import WIDEST, gather, make_halos
 from facet.mapping.quantise import quantise
 from facet.mapping.region import SUMS, is_beside, is_one_pose, within, within_slab
 from facet.mapping.settings import BLOCK, MapSettings
 from facet.mapping.store import VoxelStore
-from facet.mapping.traces import COUNT, Scratch, begin, list_votes, make_scratch
+from facet.mapping.traces import COUNT, SCRATCH, begin, list_votes
 from mapping_logs import cloud
 
 SETTINGS = MapSettings(voxel_m=0.0625)
 Word = NDArray[np.int64]
-RULE = make_rule(SETTINGS)
+RULE = make_rule(SETTINGS)[0]
 VIEWS = np.array([-7, -4, -1, 1, 4, 7]) + 8
 NORMALS = ([0, 0, 64], [37, -37, 37], [-45, 45, 1])
 
 
-@njit
-def first_halo(halos: Halo) -> Halo:
-    return halo_of(halos, 0)
-
-
 @cache
-def place() -> tuple[Word, Word, Halo]:
+def place() -> tuple[Word, Word, np.void]:
     """(N, 3) voxels round a block, (N,) what is seen of them, and the halo of that block: a full
     wall, a full floor and single voxels, seen from everywhere and with any centroid."""
     rng = np.random.default_rng(0)
@@ -56,7 +50,7 @@ def place() -> tuple[Word, Word, Halo]:
     store.columns.observable[rows] = words
     keys = store.voxel_keys(rows)
     (block,) = np.flatnonzero(store.blocks.keys[: store.num_blocks] == pack(0, 0, 0))
-    halo = first_halo(make_halos(1))
+    halo = make_halos(1)[0]
     gather(store.blocks, store.columns.observable, int(block), WIDEST, halo)
     return keys, words, halo
 
@@ -84,11 +78,11 @@ def beside(seen: int, words: Word) -> NDArray[np.bool_]:
     return np.asarray(near & ((words >> 31) & 1 == 0))
 
 
-def listed(n: int, reach: int) -> tuple[int, Word, Scratch]:
+def listed(n: int, reach: int) -> tuple[int, Word, np.recarray]:
     """(what is seen of the n-th voxel of the block, its place, votes round it)."""
     keys, words, halo = place()
     own = np.flatnonzero(((keys >= 0) & (keys < BLOCK)).all(1))[n]
-    scratch = make_scratch()
+    scratch = np.recarray(1, SCRATCH)[0]
     begin(scratch.state)
     local = int(keys[own] @ [1, 8, 64])
     assert list_votes((halo, WIDEST, local, int(words[own]), RULE), reach, scratch)

@@ -53,7 +53,7 @@ def counts(seen: int, word: int, offset: NDArray[np.int64], key: int) -> bool:
         near = 4 * dot * dot <= int(own @ own) * int(other @ other)
         return both_sides or (near and (word >> 31) & 1 == 0)
     normal = np.array([(key >> 7) & 255, (key >> 15) & 255, key >> 23]) - SLAB_UNIT
-    rule = make_rule(SETTINGS)
+    (rule,) = make_rule(SETTINGS)
     half = rule.slab if kind == SLAB else rule.thin_slab
     away = int(normal @ (8 * offset + centroid(word) - centroid(seen)))
     return abs(away) < half and int(normal @ view(word)) > 0

@@ -9,6 +9,7 @@ eq. 16 approaches, without its dependence on the order of points (method.md 4.1,
 from __future__ import annotations
 
 import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -70,8 +71,6 @@ RULE = np.dtype(  # the method's constants as the kernel wants them
 def make_rule(settings: MapSettings) -> NDArray[np.void]:
     """(1,) RULE: eq. 19-20 tabulated; eq. 25 gives the weights from epsilon and Lambda. Raises
     ValueError for an n_max that the table has no room for."""
-    if settings.n_max >= GROWTHS:
-        raise ValueError(f"n_max = {settings.n_max} is over {GROWTHS - 1} votes")
     w_sigma = settings.gain * settings.epsilon / settings.lambda_target
     counts = np.arange(GROWTHS)
     few = (settings.n_0 - counts) / (settings.n_0 - settings.n_min)
@@ -79,6 +78,8 @@ def make_rule(settings: MapSettings) -> NDArray[np.void]:
     alpha = np.clip(
         np.where(counts < settings.n_0, few, many), -settings.alpha_clip, settings.alpha_clip
     )
+    if alpha[-1] > -settings.alpha_clip:
+        raise ValueError(f"n_max = {settings.n_max} is too many votes: {GROWTHS} are tabulated")
     rule = np.recarray(1, RULE)
     rule.sigma_target = w_sigma * settings.lambda_target
     rule.w_sigma = w_sigma

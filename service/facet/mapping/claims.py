@@ -6,7 +6,7 @@ its fate. A voxel at a corner lies on two planes: the second may use it as a ver
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numba import prange
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from facet.mapping.blocks import CENTRE, Blocks, find, list_rows, pack, unpack
 from facet.mapping.kernel import kernel
 from facet.mapping.runs import dealt
-from facet.mapping.settings import VOXELS
+from facet.mapping.settings import PER_BLOCK, VOXELS
 
 LEFTOVER_REACH = 8  # voxels between a leftover and the box of the patch it joins
 CLAIM_REACH = 2  # voxels between a corner voxel and the box of a patch that claims it too
@@ -32,54 +32,41 @@ OFF = 11  # distance of the voxel in turn from the plane
 COLUMNS = 12
 
 
-class Candidates(NamedTuple):
-    """Patches that may claim the voxels of a block: N near ones, C with those two blocks away;
-    scratch of one thread."""
-
-    codes: NDArray[np.int16]  # (C,) 16 * neighbour + index
-    columns: NDArray[np.float64]  # (COLUMNS, C) eighths, from the corner of the block that asks
-    own: NDArray[np.int64]  # (PER_BLOCK,) which of them is the block's own patch, -1: none
-    angled: NDArray[np.int16]  # (N, N) for each the near ones that are at an angle to it
-    num_angled: NDArray[np.int64]  # (N,) how many these are, -1: not looked up yet
-    parallel: NDArray[np.int16]  # (N, C) for each near one those that are parallel to it
-    num_parallel: NDArray[np.int64]  # (N,) likewise
-    waiting: NDArray[np.int64]  # (N,) those that need another jamb
-    costs: NDArray[np.float64]  # (N,) of these
-    places: NDArray[np.int64]  # (125, 5) of the blocks that are asked
-
-
-class Voxels(NamedTuple):
-    """The voxels of a block, V of them; scratch of one thread."""
-
-    row: NDArray[np.int64]  # (V,)
-    place: NDArray[np.int64]
-    seen: NDArray[np.int64]  # observables
-    member: NDArray[np.int64]
-    label: NDArray[np.int64]
-    second: NDArray[np.int64]
-
-
-@kernel
-def _make_scratch(per_block):  # type: ignore[no-untyped-def]
-    most, near = 125 * per_block, 27 * per_block
-    found = Candidates(
-        np.empty(most, np.int16), np.empty((COLUMNS, most)), np.empty(per_block, np.int64),
-        np.empty((near, near), np.int16), np.empty(near, np.int64),
-        np.empty((near, most), np.int16), np.empty(near, np.int64),
-        np.empty(near, np.int64), np.empty(near), np.empty((125, 5), np.int64),
-    )  # fmt: skip
-    v = np.empty((6, VOXELS + 16), np.int64)  # 16: columns start on different cache sets
-    return found, Voxels(v[0], v[1], v[2], v[3], v[4], v[5])
+NEAR, MOST = 27 * PER_BLOCK, 125 * PER_BLOCK  # patches of a block and those beside it; and of those
+# two away
+CLAIMS = np.dtype(  # scratch of one thread: patches that may claim the voxels of a block, N near
+    # ones, C with those two blocks away; and the V voxels
+    [
+        ("codes", np.int16, (MOST,)),  # (C,) 16 * neighbour + index
+        ("columns", np.float64, (COLUMNS, MOST)),  # (COLUMNS, C) eighths, from the corner of the
+        # block that asks
+        ("own", np.int64, (PER_BLOCK,)),  # which of them is the block's own patch, -1: none
+        ("angled", np.int16, (NEAR, NEAR)),  # (N, N) for each the near ones at an angle to it
+        ("num_angled", np.int64, (NEAR,)),  # (N,) how many these are, -1: not looked up yet
+        ("parallel", np.int16, (NEAR, MOST)),  # (N, C) for each near one those parallel to it
+        ("num_parallel", np.int64, (NEAR,)),  # (N,) likewise
+        ("waiting", np.int64, (NEAR,)),  # those that need another jamb
+        ("costs", np.float64, (NEAR,)),  # of these
+        ("places", np.int64, (125, 5)),  # of the blocks that are asked
+        ("row", np.int64, (VOXELS,)),  # (V,)
+        ("place", np.int64, (VOXELS,)),
+        ("seen", np.int64, (VOXELS,)),  # observables
+        ("member", np.int64, (VOXELS,)),
+        ("label", np.int64, (VOXELS,)),
+        ("second", np.int64, (VOXELS,)),
+    ],
+    align=True,
+)
 
 
 @kernel(allocates=False)
-def _list(blocks, observable, member, block, voxels):  # type: ignore[no-untyped-def]
+def _list(blocks, observable, member, block, found):  # type: ignore[no-untyped-def]
     """List the voxels of a block. How many."""
-    count = list_rows(blocks, block, voxels.row, voxels.place)
+    count = list_rows(blocks, block, found.row, found.place)
     for v in range(count):
-        voxels.seen[v] = observable[voxels.row[v]]
+        found.seen[v] = observable[found.row[v]]
     for v in range(count):
-        voxels.member[v] = member[voxels.row[v]]
+        found.member[v] = member[found.row[v]]
     return count
 
 
@@ -298,19 +285,31 @@ def _flat(columns, count):  # type: ignore[no-untyped-def]
 
 
 @kernel(parallel=True)
-def _label_all(blocks, observable, patches, which, tolerance, changed):  # type: ignore[no-untyped-def]
-    chunks = (which.shape[0] + CHUNK - 1) // CHUNK
-    for turn in prange(chunks):
-        chunk = dealt(turn, chunks)
-        stop = min(which.shape[0], (chunk + 1) * CHUNK)
-        _label_some(blocks, observable, patches, which, chunk * CHUNK, stop, tolerance, changed)
+def _label_all(blocks, observable, patches, which, tolerance, scratches, changed):  # type: ignore[no-untyped-def]
+    step = scratches.shape[0] * CHUNK
+    for turn in prange(scratches.shape[0]):
+        share = dealt(turn, scratches.shape[0])
+        for start in range(share * CHUNK, which.shape[0], step):
+            stop = min(which.shape[0], start + CHUNK)
+            _label_some(
+                blocks,
+                observable,
+                patches,
+                which,
+                start,
+                stop,
+                tolerance,
+                scratches[share],
+                changed,
+            )
 
 
-@kernel
-def _label_some(blocks, observable, patches, which, start, stop, tolerance, changed):  # type: ignore[no-untyped-def]
-    scratch = _make_scratch(patches.votes.shape[1])
+@kernel(allocates=False)
+def _label_some(  # type: ignore[no-untyped-def]
+    blocks, observable, patches, which, start, stop, tolerance, found, changed
+):
     for q in range(start, stop):
-        changed[q] = _label_block(blocks, observable, patches, which[q], tolerance, scratch)
+        changed[q] = _label_block(blocks, observable, patches, which[q], tolerance, found)
 
 
 def label_blocks(
@@ -319,32 +318,33 @@ def label_blocks(
     patches: Any,
     which: NDArray[np.int32],
     tolerance: float,
+    scratches: NDArray[np.void],
     changed: NDArray[np.bool_],
 ) -> None:
     """Label every voxel of the blocks `which` (Q,) again; mark in `changed` (Q,) those where a
-    label changed.
+    label changed. scratches: CLAIMS, one a share of the work.
 
     Reads the patches of the next blocks, and notes in patches.far where it had to ask those two
     away; every block writes its own voxels: threads change nothing."""
+    sources = blocks, observable, patches, which
     if len(which) < FEW:
-        _label_some(blocks, observable, patches, which, 0, len(which), tolerance, changed)
+        _label_some(*sources, 0, len(which), tolerance, scratches[0], changed)
     else:
-        _label_all(blocks, observable, patches, which, tolerance, changed)
+        _label_all(*sources, tolerance, scratches, changed)
 
 
 @kernel(allocates=False)
-def _label_block(blocks, observable, patches, block, tolerance, scratch):  # type: ignore[no-untyped-def]
+def _label_block(blocks, observable, patches, block, tolerance, found):  # type: ignore[no-untyped-def]
     """Label the voxels of one block. Whether a label changed."""
-    found, voxels = scratch
     near = count = _near_candidates(blocks, patches, block, tolerance, found)
     columns, far = found.columns, False
     flat = _flat(columns, near)
-    number = _list(blocks, observable, patches.member, block, voxels)
+    number = _list(blocks, observable, patches.member, block, found)
     for v in range(number):
-        seen, member = voxels.seen[v], voxels.member[v]
+        seen, member = found.seen[v], found.member[v]
         label, second, own = -1, -1, -1
         if seen != 0:
-            c = _place(voxels.place[v], seen)
+            c = _place(found.place[v], seen)
             if member < 0 or not flat:
                 for q in range(near):
                     columns[OFF, q] = _off(columns, q, c)
@@ -362,11 +362,11 @@ def _label_block(blocks, observable, patches, block, tolerance, scratch):  # typ
                     other, alone = _claim(found, near, count, c, tolerance, own)
                 if other >= 0:
                     second = np.int64(found.codes[other])
-        voxels.label[v], voxels.second[v] = label, second
+        found.label[v], found.second[v] = label, second
     patches.far[block] = far
     changed = False
     for v in range(number):
-        row, label, second = voxels.row[v], voxels.label[v], voxels.second[v]
+        row, label, second = found.row[v], found.label[v], found.second[v]
         changed |= patches.label[row] != label or patches.second[row] != second
         patches.label[row], patches.second[row] = label, second
     return changed

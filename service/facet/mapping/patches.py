@@ -14,17 +14,16 @@ from numba import prange
 from numpy.typing import NDArray
 
 from facet.mapping.blocks import list_rows, list_voxels, row_at
-from facet.mapping.claims import HALF, OFFSET_STEP, label_blocks
+from facet.mapping.claims import CLAIMS, HALF, OFFSET_STEP, label_blocks
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory
 from facet.mapping.normals import VALID, Normals
 from facet.mapping.rungs import FIRST_RUNG, LIMITS, RUNG_STEP, RUNGS, read_rungs
 from facet.mapping.runs import SHARES, dealt
-from facet.mapping.settings import STEPS, VOXELS, MapSettings
+from facet.mapping.settings import PER_BLOCK, STEPS, VOXELS, MapSettings
 from facet.mapping.staleness import find_dependents
 from facet.mapping.store import VoxelStore
 
-PER_BLOCK = 12  # patches of a block; what finds no place is a leftover
 NORMAL_STEPS = 128.0  # the normal of a patch, as labels see it, is rounded to so many of one
 FEW = 512  # blocks that are not worth waking other threads for
 
@@ -74,15 +73,34 @@ def empty_patches() -> Patches:
     )
 
 
+GROUP = (
+    np.dtype(  # scratch of one thread: patches of a block by index, sums in eighths from its corner
+        [
+            ("votes", np.int64, (PER_BLOCK,)),
+            ("centroid", np.int64, (PER_BLOCK, 3)),
+            ("scatter", np.int64, (PER_BLOCK, 6)),
+            ("unit", np.int64, (PER_BLOCK, 3)),
+            ("box", np.int64, (PER_BLOCK, 6)),
+            ("label", np.int64, (VOXELS,)),  # by place, -1: none
+            ("rows", np.int64, (VOXELS,)),
+            ("places", np.int64, (VOXELS,)),
+            ("order", np.int32, (VOXELS,)),
+        ],
+        align=True,
+    )
+)
+
+
 @kernel(allocates=False)
-def _join(votes, centroid, unit, count, c, n, grouping):  # type: ignore[no-untyped-def]
+def _join(own, count, c, n, grouping):  # type: ignore[no-untyped-def]
     """Index of the patch that takes a voxel at c (eighths) with normal n; -1: none."""
+    votes, centroid, unit = own.votes, own.centroid, own.unit
+    size = np.sqrt(float(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]))
     best, best_cost = -1, 2.0
     for p in range(count):
         ux, uy, uz = float(unit[p, 0]), float(unit[p, 1]), float(unit[p, 2])
         length = np.sqrt(ux * ux + uy * uy + uz * uz)
-        own = np.sqrt(float(n[0] * n[0] + n[1] * n[1] + n[2] * n[2]))
-        cos = (ux * n[0] + uy * n[1] + uz * n[2]) / (length * own)
+        cos = (ux * n[0] + uy * n[1] + uz * n[2]) / (length * size)
         if cos < grouping.cos_angle:
             continue
         v = float(votes[p])
@@ -97,14 +115,14 @@ def _join(votes, centroid, unit, count, c, n, grouping):  # type: ignore[no-unty
 
 
 @kernel
-def _group(blocks, observable, normals, patches, block, grouping, scratch):  # type: ignore[no-untyped-def]
+def _group(blocks, observable, normals, block, grouping, own):  # type: ignore[no-untyped-def]
     """Group a block's valid voxels, best thickness angle first. Returns how many patches."""
-    votes, centroid, scatter, unit, box, label, rows, places = scratch
+    votes, centroid, scatter, unit, box = own.votes, own.centroid, own.scatter, own.unit, own.box
+    label, rows, places, order = own.label, own.rows, own.places, own.order
     votes[:] = 0
     centroid[:] = 0
     scatter[:] = 0
     unit[:] = 0
-    order = np.empty(VOXELS, np.int32)
     num = 0
     for v in range(list_voxels(blocks, block, blocks.occupied[block], rows, places)):
         order[num] = (np.int32(normals.thickness[rows[v]]) << 9) | places[v]
@@ -112,20 +130,15 @@ def _group(blocks, observable, normals, patches, block, grouping, scratch):  # t
     ordered = np.sort(order[:num])
     label[:] = -1
     count = 0
-    c = np.zeros(3, np.int64)
-    n = np.zeros(3, np.int64)
     for o in range(num):
         local = ordered[o] & 511
         row = row_at(blocks, block, local)
         seen = observable[row]
         x, y, z = local & 7, (local >> 3) & 7, local >> 6
-        c[0], c[1], c[2] = (
-            8 * x + (seen & 15),
-            8 * y + ((seen >> 4) & 15),
-            8 * z + ((seen >> 8) & 15),
-        )
-        n[0], n[1], n[2] = normals.unit[row, 0], normals.unit[row, 1], normals.unit[row, 2]
-        p = _join(votes, centroid, unit, count, c, n, grouping)
+        c = 8 * x + (seen & 15), 8 * y + ((seen >> 4) & 15), 8 * z + ((seen >> 8) & 15)
+        u = normals.unit[row]
+        n = np.int64(u[0]), np.int64(u[1]), np.int64(u[2])
+        p = _join(own, count, c, n, grouping)
         if p < 0:
             if count == PER_BLOCK:
                 continue
@@ -171,10 +184,11 @@ def _round_plane(votes, centroid, unit, plane):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _store(blocks, patches, block, count, scratch):  # type: ignore[no-untyped-def]
+def _store(blocks, patches, block, count, own):  # type: ignore[no-untyped-def]
     """Write a block's grouping. Whether it differs from what was there, and whether for the labels
     of other blocks."""
-    votes, centroid, scatter, unit, box, label, rows, places = scratch
+    votes, centroid, scatter, unit, box = own.votes, own.centroid, own.scatter, own.unit, own.box
+    label, rows, places = own.label, own.rows, own.places
     changed = shows = patches.number[block] != count
     patches.number[block] = count
     for p in range(count):
@@ -199,34 +213,25 @@ def _store(blocks, patches, block, count, scratch):  # type: ignore[no-untyped-d
 
 @kernel
 def _group_some(  # type: ignore[no-untyped-def]
-    blocks, observable, normals, patches, which, start, stop, grouping, changed, shows
+    blocks, observable, normals, patches, which, start, stop, grouping, own, changed, shows
 ):
-    scratch = (
-        np.zeros(PER_BLOCK, np.int64),
-        np.zeros((PER_BLOCK, 3), np.int64),
-        np.zeros((PER_BLOCK, 6), np.int64),
-        np.zeros((PER_BLOCK, 3), np.int64),
-        np.zeros((PER_BLOCK, 6), np.int64),
-        np.zeros(VOXELS, np.int64),
-        np.zeros(VOXELS, np.int64),
-        np.zeros(VOXELS, np.int64),
-    )
     for q in range(start, stop):
-        count = _group(blocks, observable, normals, patches, which[q], grouping, scratch)
-        changed[q], shows[q] = _store(blocks, patches, which[q], count, scratch)
+        count = _group(blocks, observable, normals, which[q], grouping, own)
+        changed[q], shows[q] = _store(blocks, patches, which[q], count, own)
 
 
 @kernel(parallel=True)
 def _group_all(  # type: ignore[no-untyped-def]
-    blocks, observable, normals, patches, which, grouping, changed, shows
+    blocks, observable, normals, patches, which, grouping, scratches, changed, shows
 ):
     size = (which.shape[0] + SHARES - 1) // SHARES  # blocks beside one another share cache lines
     for turn in prange(SHARES):
         share = dealt(turn, SHARES)
         start, stop = share * size, min(which.shape[0], (share + 1) * size)
         _group_some(
-            blocks, observable, normals, patches, which, start, stop, grouping, changed, shows
-        )
+            blocks, observable, normals, patches, which, start, stop, grouping, scratches[share],
+            changed, shows,
+        )  # fmt: skip
 
 
 class PatchField:
@@ -243,6 +248,7 @@ class PatchField:
         self.patches = empty_patches()
         self.histogram = np.zeros(RUNGS, np.int64)  # voxels by the rung of their patch
         self._flags = np.zeros(0, np.bool_)
+        self._groups, self._claims = np.empty(SHARES, GROUP), np.empty(SHARES, CLAIMS)
 
     def update(
         self,
@@ -260,14 +266,15 @@ class PatchField:
         changed, shows = np.empty(len(dirty), np.bool_), np.empty(len(dirty), np.bool_)
         sources = store.blocks, store.columns.observable, normals, self.patches
         if len(dirty) < FEW:
-            _group_some(*sources, dirty, 0, len(dirty), self._grouping, changed, shows)
+            scratch = self._groups[0]
+            _group_some(*sources, dirty, 0, len(dirty), self._grouping, scratch, changed, shows)
         else:
-            _group_all(*sources, dirty, self._grouping, changed, shows)
+            _group_all(*sources, dirty, self._grouping, self._groups, changed, shows)
         near = np.union1d(self._around(store, dirty[shows]), dirty)
         relabelled = np.zeros(len(near), np.bool_)
         label_blocks(
             store.blocks, store.columns.observable, self.patches, near, self._grouping.leftover,
-            relabelled,
+            self._claims, relabelled,
         )  # fmt: skip
         relabelled_blocks = near[relabelled]
         touched = np.union1d(block_of[touched_rows], np.union1d(dirty, relabelled_blocks))

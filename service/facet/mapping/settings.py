@@ -8,6 +8,7 @@ TICKS = 1024  # ticks per voxel edge
 STEPS = 8  # steps of a rounded centroid, and of a contour's (u, v), per voxel edge
 BLOCK = 8  # voxels per block edge
 VOXELS = BLOCK**3  # of a block
+PER_BLOCK = 12  # patches of a block; what finds no place is a leftover
 TILE = 64  # voxels per tile edge
 ALPHA2 = 1603  # squared alpha radius of contours, (1/8 voxel)^2: 5.005 voxels.
 # 1603 = 7 * 229 is no sum of two rational squares, so no circle of this radius goes through three

@@ -16,9 +16,10 @@ from facet.mapping.membership import COLLECT, LOOK, MOVED, TOUCHED, follow_plane
 from facet.mapping.memory import Heap, Memory
 from facet.mapping.merging import Limits, Nodes
 from facet.mapping.normals import Normals
-from facet.mapping.patches import PER_BLOCK, PatchField
+from facet.mapping.patches import PatchField
 from facet.mapping.renewal import Renewal
 from facet.mapping.runs import starts_of
+from facet.mapping.settings import PER_BLOCK
 from facet.mapping.store import Touched, VoxelStore
 from facet.mapping.tile import Tile, empty_tile
 
