@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from facet.mapping.digest import Digest
 from facet.mapping.mapper import Mapper
+from facet.mapping.quantise import Ticks
 from facet.mapping.settings import MapSettings
 from facet.simulate import simulate
 from facet_protocol.maps import encode_update
@@ -27,6 +28,9 @@ SIMULATED = {
     "room-depth": ("room", "depth", 12, 0.05),
 }
 LOGS = (*SIMULATED, "office-lidar3d", "real-corridor")
+
+
+NOBODY, ORIGIN = np.zeros((0, 3), np.int64), np.zeros(3, np.int64)
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +82,19 @@ def cloud(
         Pose(position, np.array([0.0, 0.0, 0.0, 1.0])),
         (points - position).astype(np.float32), (ends - position).astype(np.float32).reshape(-1, 3),
     )  # fmt: skip
+
+
+def ticks_of_one(
+    points: NDArray[np.integer],
+    views: NDArray[np.integer],
+    beams: NDArray[np.integer] = NOBODY,
+    sensor: NDArray[np.integer] = ORIGIN,
+    pose_hash: int = -1,
+) -> Ticks:
+    """One scan in ticks."""
+    starts, beam_starts = np.array([0, len(points)]), np.array([0, len(beams)])
+    hashes = np.array([pose_hash])
+    return Ticks(points, views, starts, beams, beam_starts, sensor[None], hashes, ({},))
 
 
 def wall(

@@ -22,8 +22,8 @@ from facet.mapping.blocks import (
     unpack_all,
 )
 from facet.mapping.invariants import check_blocks
-from facet.mapping.quantise import Ticks
 from facet.mapping.store import VoxelStore
+from mapping_logs import ticks_of_one
 
 index = st.integers(-OFFSET, OFFSET - 1)
 triple = st.tuples(index, index, index)
@@ -78,7 +78,7 @@ def store_of(voxels: np.ndarray) -> VoxelStore:
     store = VoxelStore()
     ticks = voxels.astype(np.int64) * 1024 + 512
     views = np.tile(np.array([127, 0, 0], np.int16), (len(ticks), 1))
-    store.insert(Ticks(ticks, views, np.zeros((0, 3), np.int64), np.zeros(3, np.int64), -1, {}))
+    store.insert(ticks_of_one(ticks, views))
     return store
 
 

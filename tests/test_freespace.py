@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from facet.mapping.blocks import unpack_all
 from facet.mapping.freespace import BEAMS_OF, SHIFT, FreeSpace
 from facet.mapping.quantise import Ticks
+from mapping_logs import ticks_of_one
 
 Points = NDArray[np.int64]
 NOTHING = np.zeros((0, 3), np.int64)
@@ -26,7 +27,7 @@ def ticks_of(
     """A scan whose beams are all followed (a line scan's), unless `hashed` is -1."""
     hits, empty = (np.asarray(p, np.int64).reshape(-1, 3) for p in (points, beams))
     views = np.zeros((len(hits), 3), np.int16)
-    return Ticks(hits, views, empty, np.asarray(sensor, np.int64), hashed, {})
+    return ticks_of_one(hits, views, empty, np.asarray(sensor, np.int64), hashed)
 
 
 def cells_of(free: FreeSpace) -> dict[tuple[int, ...], int]:
@@ -130,14 +131,14 @@ def test_removed_beams_leave_nothing(seed: int) -> None:
 def test_a_cloud_is_thinned_by_a_hash_of_its_ends() -> None:
     """The same beams whatever else is in the scan: so it adds up."""
     whole = many(7, 4000, hashed=-1)
-    halves = [whole._replace(points=p, beams=b) for p, b in (
+    halves = [ticks_of(whole.sensors[0], p, b, -1) for p, b in (
         (whole.points[::2], whole.beams[1::2]), (whole.points[1::2], whole.beams[::2]),
     )]  # fmt: skip
     one, two, all_of = FreeSpace(), FreeSpace(), FreeSpace()
     one.insert(whole)
     for half in halves:
         two.insert(half)
-    all_of.insert(whole._replace(pose_hash=0))
+    all_of.insert(whole._replace(pose_hashes=np.zeros(1, np.int64)))
     assert cells_of(one) == cells_of(two)
     share = sum(cells_of(one).values()) / sum(cells_of(all_of).values())
     assert share == pytest.approx(1.0 / BEAMS_OF, rel=0.15)

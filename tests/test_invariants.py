@@ -53,12 +53,12 @@ FAULTS: dict[str, Callable[[Mapper], object]] = {
     "the histogram": lambda m: add(m._patches.histogram, 3, 1),
     "an occupation": lambda m: add(tile(m).occupation, 0, 1),  # type: ignore[attr-defined]
     "a plane's name": rename,
-    "a count": lambda m: m._census.count(log("room-depth").scans[0], _ticks(m), 1),
+    "a count": lambda m: m._census.count(log("room-depth").scans[:1], _ticks(m), 1),
 }
 
 
 def _ticks(mapper: Mapper) -> Ticks:
-    return quantise(log("room-depth").scans[0], mapper.settings)
+    return quantise([log("room-depth").scans[0]], mapper.settings)
 
 
 def test_a_map_is_what_it_must_be() -> None:

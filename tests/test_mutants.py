@@ -194,7 +194,9 @@ def test_the_first_point_wins_is_noticed(monkeypatch: Patch) -> None:
     def inserts(self: VoxelStore, ticks: Ticks) -> None:
         there = {tuple(v) for v in self.voxel_keys(self.occupied_rows()).tolist()}
         new = [tuple(v) not in there for v in (ticks.points // TICKS).tolist()]
-        insert(self, ticks._replace(points=ticks.points[new], views=ticks.views[new]))
+        starts = np.append(0, np.cumsum(new))[ticks.starts]
+        kept = ticks._replace(points=ticks.points[new], views=ticks.views[new], starts=starts)
+        insert(self, kept)
 
     monkeypatch.setattr(VoxelStore, "insert", inserts)
     broken(order)

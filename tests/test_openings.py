@@ -34,7 +34,7 @@ def beams(seed: int, low: float, high: float, end: float = 4.0, count: int = 400
     ends = np.stack([np.full(count, end), *yz], axis=1)
     free = FreeSpace()
     scan = cloud(np.zeros((0, 3)), at=(0.0, 2.0, 1.7), no_return=ends)
-    free.insert(quantise(scan, SETTINGS))
+    free.insert(quantise([scan], SETTINGS))
     return free
 
 

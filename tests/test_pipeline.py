@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -28,9 +29,10 @@ class CountingMapper:
         self.changed_tiles: list[tuple[int, int, int]] = []
         self.restless: list[tuple[int, int, int]] = []  # tiles that change with every update
 
-    def insert(self, scan: Scan) -> Any:
-        self.scans.append(scan)
-        return SimpleNamespace(points_stored=len(scan.points) - 1, rejected={"nan": 1})
+    def insert_all(self, scans: Sequence[Scan]) -> list[Any]:
+        self.scans += scans
+        nan = {"nan": 1}
+        return [SimpleNamespace(points_stored=len(s.points) - 1, rejected=nan) for s in scans]
 
     def update(self, timer: Any) -> MapUpdate:
         timer("normals")
@@ -164,10 +166,10 @@ def test_two_runs_say_the_same_bytes() -> None:
 def test_a_fault_of_the_mapper_is_not_hidden(monkeypatch: pytest.MonkeyPatch) -> None:
     rig = Rig()
 
-    def fail(scan: Scan) -> Any:
+    def fail(scans: Sequence[Scan]) -> Any:
         raise AssertionError("an invariant")
 
-    monkeypatch.setattr(rig.mapper, "insert", fail)
+    monkeypatch.setattr(rig.mapper, "insert_all", fail)
     with pytest.raises(AssertionError, match="an invariant"):
         rig.pipeline.insert(room(1)[0])
 

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from facet.mapping.mapper import Mapper
 from facet.mapping.merging import limits
-from facet.mapping.planes import FREE, detail_level, group_planes, tabulate
+from facet.mapping.planes import FREE, detail_level, group_planes
 from facet.mapping.settings import MapSettings
+from facet.mapping.table import tabulate
 from mapping_logs import log, mapped
 
 UNBOUND = MapSettings(detail_level=0.98, min_area_m2=1e9)

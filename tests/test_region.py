@@ -26,17 +26,18 @@ NORMALS = ([0, 0, 64], [37, -37, 37], [-45, 45, 1])
 
 
 @cache
-def place() -> tuple[Word, Word, np.void]:
+def place(across: int = 0) -> tuple[Word, Word, np.void]:
     """(N, 3) voxels round a block, (N,) what is seen of them, and the halo of that block: a full
-    wall, a full floor and single voxels, seen from everywhere and with any centroid."""
+    wall across an axis, a full floor and single voxels, seen from everywhere and with any
+    centroid."""
     rng = np.random.default_rng(0)
     span = np.arange(-WIDEST, BLOCK + WIDEST)
     floor = np.stack(np.meshgrid(span, span, [3]), -1).reshape(-1, 3)
-    wall = np.stack(np.meshgrid([2], span, span), -1).reshape(-1, 3)
+    wall = np.roll(np.stack(np.meshgrid([2], span, span), -1).reshape(-1, 3), across, axis=1)
     loose = rng.integers(-WIDEST, BLOCK + WIDEST, (2000, 3))
     voxels = np.unique(np.concatenate([floor, wall, loose]), axis=0)
     store = VoxelStore()
-    store.insert(quantise(cloud((voxels + 0.5) * SETTINGS.voxel_m, at=(9.0, 9.0, 9.0)), SETTINGS))
+    store.insert(quantise([cloud((voxels + 0.5) * SETTINGS.voxel_m, at=(9.0, 9.0, 9.0))], SETTINGS))
     store.settle()
     rows = store.occupied_rows()
     words = np.zeros(len(rows), np.int64)
@@ -52,6 +53,7 @@ def place() -> tuple[Word, Word, np.void]:
     (block,) = np.flatnonzero(store.blocks.keys[: store.num_blocks] == pack(0, 0, 0))
     halo = make_halos(1)[0]
     gather(store.blocks, store.columns.observable, int(block), WIDEST, halo)
+    assert halo["along_y"] == (across == 0)
     return keys, words, halo
 
 
@@ -78,9 +80,9 @@ def beside(seen: int, words: Word) -> NDArray[np.bool_]:
     return np.asarray(near & ((words >> 31) & 1 == 0))
 
 
-def listed(n: int, reach: int) -> tuple[int, Word, np.recarray]:
+def listed(n: int, reach: int, across: int = 0) -> tuple[int, Word, np.recarray]:
     """(what is seen of the n-th voxel of the block, its place, votes round it)."""
-    keys, words, halo = place()
+    keys, words, halo = place(across)
     own = np.flatnonzero(((keys >= 0) & (keys < BLOCK)).all(1))[n]
     scratch = np.recarray(1, SCRATCH)[0]
     begin(scratch.state)
@@ -89,12 +91,14 @@ def listed(n: int, reach: int) -> tuple[int, Word, np.recarray]:
     return int(words[own]), keys[own], scratch
 
 
+@pytest.mark.parametrize("across", [0, 1])
 @pytest.mark.parametrize("reach", [1, 3, 4, 9, WIDEST])
-def test_sums_are_those_of_the_definition(reach: int) -> None:
-    keys, words, _ = place()
+def test_sums_are_those_of_the_definition(reach: int, across: int) -> None:
+    """Whichever way the rows of the halo lie."""
+    keys, words, _ = place(across)
     some = 0
     for n in range(0, 120, 8):
-        seen, at, scratch = listed(n, reach)
+        seen, at, scratch = listed(n, reach, across)
         away = np.abs(keys - at).max(1)
         out = np.zeros(SUMS, np.int32)
         for r in range(1, reach + 1):
@@ -121,12 +125,13 @@ def test_sides_are_those_of_the_single_votes() -> None:
         assert [is_beside(seen, int(w)) for w in words[:200]] == beside(seen, words[:200]).tolist()
 
 
+@pytest.mark.parametrize("across", [0, 1])
 @pytest.mark.parametrize("reach", [1, 3])
-def test_one_pose_is_that_of_all_votes(reach: int) -> None:
-    keys, words, _ = place()
+def test_one_pose_is_that_of_all_votes(reach: int, across: int) -> None:
+    keys, words, _ = place(across)
     found = set()
     for n in range(120):
-        seen, at, scratch = listed(n, reach)
+        seen, at, scratch = listed(n, reach, across)
         poses = (words >> 32)[(np.abs(keys - at).max(1) <= reach) & beside(seen, words)]
         expected = len(set(poses.tolist())) == 1 and poses[0] != 0
         one = is_one_pose(scratch.votes, scratch.poses, scratch.state[COUNT], reach)

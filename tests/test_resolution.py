@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
@@ -201,9 +202,9 @@ class CountingMapper:
         self.changed_tiles: list[Any] = []
         self._scans: list[tuple[str, int, float]] = []
 
-    def insert(self, scan: Scan) -> Any:
-        self._scans.append((scan.robot, scan.sequence, float(scan.pose.position[0])))
-        return SimpleNamespace(points_stored=len(scan.points), rejected={})
+    def insert_all(self, scans: Sequence[Scan]) -> list[Any]:
+        self._scans += [(s.robot, s.sequence, float(s.pose.position[0])) for s in scans]
+        return [SimpleNamespace(points_stored=len(s.points), rejected={}) for s in scans]
 
     def update(self, timer: Any) -> MapUpdate:
         self.updates.append(sorted(self._scans))
@@ -268,8 +269,7 @@ def test_a_replay_puts_every_scan_into_the_update_that_had_it(data: st.DataObjec
             log.flush()
         elif kind == "update":
             taken, inbox = inbox, []
-            for envelope in taken:
-                pipeline.insert(envelope)
+            pipeline.insert(*taken)
             if pipeline.is_stale:
                 pipeline.update()
         else:

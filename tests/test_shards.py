@@ -15,7 +15,7 @@ from facet.mapping.quantise import Ticks, quantise
 from facet.mapping.settings import TICKS, TILE, MapSettings
 from facet.mapping.store import VoxelStore
 from facet_protocol.messages import Scan, ScanKind
-from mapping_logs import cloud
+from mapping_logs import cloud, ticks_of_one
 
 SETTINGS = MapSettings(voxel_m=0.1)
 HALO = SETTINGS.max_radius
@@ -44,7 +44,7 @@ def within(voxels: NDArray[np.int64], tile: NDArray[np.int64], halo: int = 0) ->
 def shard(ticks: Ticks, tile: NDArray[np.int64], halo: int) -> Ticks:
     """The points of a scan that are this tile's business."""
     kept = within(ticks.points // TICKS, tile, halo)
-    return ticks._replace(points=ticks.points[kept], views=ticks.views[kept])
+    return ticks_of_one(ticks.points[kept], ticks.views[kept], pose_hash=ticks.pose_hashes[0])
 
 
 def sharded(scans: Sequence[Ticks], halo: int) -> Table:
@@ -73,7 +73,7 @@ def surface(rng: np.random.Generator, count: int, noise_m: float, number: int) -
 def scene(seed: int, counts: Sequence[int], noise_m: float) -> list[Ticks]:
     rng = np.random.default_rng(seed)
     scans = [surface(rng, count, noise_m, k) for k, count in enumerate(counts, start=1)]
-    return [quantise(scan, SETTINGS) for scan in scans]
+    return [quantise([scan], SETTINGS) for scan in scans]
 
 
 @settings(max_examples=10, deadline=None)

@@ -11,11 +11,11 @@ from facet.mapping.blocks import pack_all
 from facet.mapping.digest import state_digest
 from facet.mapping.freespace import FreeSpace
 from facet.mapping.invariants import check_blocks, check_moments, check_observables
+from facet.mapping.observable import observe
 from facet.mapping.quantise import VIEW, Ticks
-from facet.mapping.store import VoxelStore, observe
+from facet.mapping.store import VoxelStore
 from facet.mapping.sums import sums_of, write_sums
-
-NOBODY = np.zeros((0, 3), np.int64)
+from mapping_logs import ticks_of_one
 
 
 def ticks_of(seed: int, count: int, width: int = 12, pose_hash: int = -1) -> Ticks:
@@ -24,7 +24,7 @@ def ticks_of(seed: int, count: int, width: int = 12, pose_hash: int = -1) -> Tic
     points = rng.integers(-512 * width, 512 * width, (count, 3))
     views = rng.normal([1.5, 0.0, 0.0], 1.0, (count, 3))
     views = np.floor(views / np.linalg.norm(views, axis=1, keepdims=True) * VIEW + 0.5)
-    return Ticks(points, views.astype(np.int16), NOBODY, np.zeros(3, np.int64), pose_hash, {})
+    return ticks_of_one(points, views.astype(np.int16), pose_hash=pose_hash)
 
 
 def table(store: VoxelStore) -> dict[tuple[int, int, int], tuple[list[int], ...]]:
@@ -48,8 +48,8 @@ def plain(scans: list[Ticks]) -> dict[tuple[int, int, int], tuple[list[int], ...
                 m[i] += s
             for i in range(3):
                 v[i] += view[i]
-            if scan.pose_hash >= 0:
-                for i, s in enumerate((1, scan.pose_hash, scan.pose_hash**2)):
+            if scan.pose_hashes[0] >= 0:
+                for i, s in enumerate((1, scan.pose_hashes[0], scan.pose_hashes[0] ** 2)):
                     h[i] += s
     return sums
 
@@ -221,7 +221,7 @@ def test_the_mean_observable_fades_as_one_over_n() -> None:
     for n in range(1, 161):
         points = rng.integers(0, 512, (400, 3)) + corner
         views = np.tile(np.array([VIEW, 0, 0], np.int16), (400, 1))
-        store.insert(Ticks(points, views, NOBODY, np.zeros(3, np.int64), -1, {}))
+        store.insert(ticks_of_one(points, views))
         flips[n] = len(store.settle().rows) / 400
     late = np.mean([n * flips[n] for n in range(80, 161)])
     assert 0.2 < late < 4.0
@@ -252,7 +252,7 @@ def test_sums_are_carried_point_by_point() -> None:
     """The same 20,000 points again and again, past the range of the low parts on both sides."""
     points = np.full((20_000, 3), 1023)
     views = np.tile(np.array([VIEW, 0, -VIEW], np.int16), (20_000, 1))
-    scan = Ticks(points, views, NOBODY, np.zeros(3, np.int64), -1, {})
+    scan = ticks_of_one(points, views)
     store, row = VoxelStore(), np.zeros(1, np.int32)
     for times in range(1, 21):
         store.insert(scan)

@@ -8,8 +8,7 @@ from hypothesis import strategies as st
 
 from facet.mapping.blocks import pack, pack_all, unpack
 from facet.mapping.mapper import Mapper
-from facet.mapping.runs import starts_of
-from facet.mapping.tile import edges_of
+from facet.mapping.table import tabulate
 from facet.mapping.tiles import spread, tile_keys_of
 from mapping_logs import cloud, log, mapped, wall
 
@@ -77,9 +76,7 @@ def test_adjacent_tile_planes_are_listed_once() -> None:
     whole = log("room-lidar3d")
     tiles = mapped(whole.scans, whole.settings)._tiles.tiles
     held = sorted((t for t in tiles.values() if t.num_planes), key=lambda t: t.key)
-    starts = starts_of([tile.num_planes for tile in held])
-    tile_of = np.repeat(np.arange(len(held)), np.diff(starts))
-    edges = edges_of(held, starts)
+    tile_of, edges = tabulate(tiles).tile_of, tabulate(tiles).edges
     assert len(edges) > len(tile_of)
     assert len(np.unique(edges, axis=0)) == len(edges)
     assert np.all(edges[:, 0] < edges[:, 1])

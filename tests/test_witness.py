@@ -24,8 +24,8 @@ def scan(stamp_ns: int, robot: str, *points: tuple[float, float, float]) -> Scan
 
 def noted(*scans: Scan) -> Witness:
     witness = Witness()
-    for one in scans:
-        witness.note(quantise(one, SETTINGS), one)
+    if scans:
+        witness.note(quantise(scans, SETTINGS), scans)
     return witness
 
 

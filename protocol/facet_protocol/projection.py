@@ -91,6 +91,8 @@ def project_fan(
     r = np.asarray(ranges, dtype=np.float64)
     sine, cosine = fan_directions(start_angle, end_angle, r.size)
     hit = (r > 0.0) & (r < np.inf)
+    if hit.all():
+        return _beam_ends(cosine, sine, r), np.zeros((0, 3), np.float32)
     empty = r == np.inf
     return (
         _beam_ends(cosine[hit], sine[hit], r[hit]),

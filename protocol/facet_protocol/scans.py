@@ -129,6 +129,7 @@ def project(
 ) -> Scan:
     """The fan as points in the sensor's x-y plane."""
     points, no_return = project_fan(fan.start_angle, fan.end_angle, fan.ranges, reach_m)
+    is_whole = len(points) + len(no_return) == len(fan.ranges)
     return Scan(
         robot=fan.robot,
         sensor=fan.sensor,
@@ -140,7 +141,7 @@ def project(
         pose=fan.pose,
         points=points,
         no_return=no_return,
-        ignored=count_ignored(fan.ranges),
+        ignored={} if is_whole else count_ignored(fan.ranges),
         renormalised=renormalised,
         has_pose=has_pose,
     )

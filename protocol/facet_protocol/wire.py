@@ -123,16 +123,15 @@ def check_pose(position: Iterable[float], orientation_xyzw: Iterable[float]) -> 
     Raises ProtocolError: bad_pose when something is not finite, bad_quaternion when the norm is off
     by more than NORM_TOLERANCE. By + * / sqrt alone: the same bits on every machine.
     """
-    p = np.array(list(position), dtype=np.float64)
-    q = [float(c) for c in orientation_xyzw]
-    if p.size != 3 or len(q) != 4:
-        raise ProtocolError(f"pose of {p.size} + {len(q)} numbers, expected 3 + 4", "bad_pose")
-    if not all(map(math.isfinite, [*p.tolist(), *q])):
-        raise ProtocolError(f"pose {p.tolist()} {q} is not finite", "bad_pose")
+    p, q = [float(c) for c in position], [float(c) for c in orientation_xyzw]
+    if len(p) != 3 or len(q) != 4:
+        raise ProtocolError(f"pose of {len(p)} + {len(q)} numbers, expected 3 + 4", "bad_pose")
+    if not all(map(math.isfinite, (*p, *q))):
+        raise ProtocolError(f"pose {p} {q} is not finite", "bad_pose")
     norm = math.sqrt(q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3])
     if not abs(norm - 1.0) <= NORM_TOLERANCE:
         raise ProtocolError(f"quaternion {q} has norm {norm:.6g}", "bad_quaternion")
-    return Pose(p, np.array(normalised(q))), abs(norm - 1.0) > 1e-9
+    return Pose(np.array(p), np.array(normalised(q))), abs(norm - 1.0) > 1e-9
 
 
 def normalised(q: Sequence[float]) -> list[float]:

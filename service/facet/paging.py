@@ -45,6 +45,8 @@ class PagedMemory:
 
     Where the disk is full, a column stays in plain memory, and a warning says so."""
 
+    growth = 2  # room is taken from the disk, and nothing is copied
+
     def __init__(self, directory: Path, max_bytes: int) -> None:
         self._directory, self._max_bytes = directory, max_bytes
         self._regions: dict[int, Region] = {}  # by the address of the column

@@ -26,6 +26,7 @@ from facet_protocol.messages import (
 )
 
 Tile = tuple[int, int, int]
+AT_ONCE = 16  # scans that go into the map together, of whichever robots
 BEATS = 16  # in a period, to one of which the points of a tile are sent
 RECORD_TOPICS = {
     ResolvedPose: topics.RESOLVED_TOPIC,
@@ -62,6 +63,7 @@ class Pipeline:
         self._mapper, self._admission, self._account = mapper, admission, account
         self._sinks, self._outgoing = tuple(sinks), outgoing
         self._points_every_ns = points_every_ns  # 0: points are not sent
+        self._admitted: list[Admitted] = []  # not in the map yet: within a call alone
         self._applied: dict[str, Applied] = {}
         self._replaced: list[Conflict] = []  # since the last update
         self._changed_tiles: set[Tile] = set()
@@ -77,11 +79,17 @@ class Pipeline:
         self.revision, self.log_time_ns = self._mapper.revision, other.log_time_ns
         self.is_stale = other.is_stale
 
-    def insert(self, envelope: Envelope) -> bool:
-        """Take one message, without deriving anything; False when it changes nothing in the map: it
-        is left out, it waits, or it is a pose that no scan waits for."""
-        self.log_time_ns = max(self.log_time_ns, envelope.received_ns)
-        return self._apply(self._admission.admit(envelope))
+    def insert(self, *envelopes: Envelope) -> bool:
+        """Take messages, without deriving anything; False when they change nothing in the map: they
+        are left out, they wait, or are poses that no scan waits for."""
+        num_changes = 0
+        for envelope in envelopes:
+            self.log_time_ns = max(self.log_time_ns, envelope.received_ns)
+            num_changes += self._apply(self._admission.admit(envelope))
+            if len(self._admitted) >= AT_ONCE:
+                self._put_in()
+        self._put_in()
+        return num_changes > 0
 
     def go_live(self) -> None:
         """The log that was read ends here: what comes now is new. It may lack the record of what
@@ -89,30 +97,35 @@ class Pipeline:
         for conflict in self._replaced:
             self._say(conflict)
         self._apply(self._admission.go_live())
+        self._put_in()
 
     def go_on(self) -> bool:
         """Apply the corrections whose points have come from the log."""
-        return self._apply(self._admission.go_on())
+        return self._apply(self._admission.go_on()) > 0
 
     @property
     def is_settled(self) -> bool:
         """The map is what the log says, up to the last message that was taken."""
         return not self.is_stale and not self._admission.num_correcting
 
-    def _apply(self, admitted: Sequence[Outcome]) -> bool:
+    def _apply(self, admitted: Sequence[Outcome]) -> int:
+        """How many scans come, go or move. Those that only come are put in together, later."""
         num_changes = 0
         for one in admitted:
             if isinstance(one, Moved):
+                self._put_in()
                 self._move(one)
                 self._say(one.corrected)
                 num_changes += len(one.scans)
                 continue
             if isinstance(one, Admitted):
-                self._take(one)
+                self._admitted.append(one)
                 num_changes += 1
+                if one.replaced is not None:
+                    self._put_in()
             for record in one.records:
                 self._say(record)
-        return num_changes > 0
+        return num_changes
 
     def _say(self, message: ResolvedPose | Corrected | Conflict) -> None:
         topic = RECORD_TOPICS[type(message)]
@@ -149,14 +162,24 @@ class Pipeline:
         changes.subtract(_points(old, taken_out))
         return dict(changes)
 
-    def _take(self, admitted: Admitted) -> None:
-        envelope, scan, records, replaced = admitted
-        if replaced is not None:
-            self._account.settle(scan.source, "conflict", also=self._exchange(replaced, scan))
-            self._replaced += [record for record in records if isinstance(record, Conflict)]
-        else:
-            points = _points(scan, self._mapper.insert(scan))
-            self._account.settle(scan.source, "applied", also=points)
+    def _put_in(self) -> None:
+        """What was admitted, into the map: the scans that take the place of no other at once."""
+        admitted, self._admitted = self._admitted, []
+        new = [one for one in admitted if one.replaced is None]
+        inserted = self._mapper.insert_all([one.scan for one in new]) if new else []
+        for one, counted in zip(new, inserted, strict=True):
+            self._account.settle(one.scan.source, "applied", also=_points(one.scan, counted))
+            self._note(one)
+        for one in admitted:
+            if one.replaced is not None:
+                points = self._exchange(one.replaced, one.scan)
+                self._account.settle(one.scan.source, "conflict", also=points)
+                self._replaced += [r for r in one.records if isinstance(r, Conflict)]
+                self._note(one)
+
+    def _note(self, admitted: Admitted) -> None:
+        """It is in the map."""
+        envelope, scan = admitted.envelope, admitted.scan
         previous = self._applied.get(scan.source)
         num_scans = (previous.num_scans if previous else 0) + 1
         self._applied[scan.source] = Applied(envelope, scan, num_scans)
@@ -181,7 +204,9 @@ class Pipeline:
     def finish(self, timeout_s: float | None = None) -> None:
         """Settle what still waits for its pose, or, as long as that, for its points; send what was
         held back: the last points, the last scene."""
-        if self._apply(self._admission.finish(timeout_s)):
+        num_changes = self._apply(self._admission.finish(timeout_s))
+        self._put_in()
+        if num_changes:
             self.update()
         self._emit(self._outgoing.finish(self.log_time_ns))
         self._send_points(None)
@@ -236,8 +261,10 @@ class Pipeline:
 
 def _points(scan: Scan, counted: Counted) -> dict[str, int]:
     """What the points of a scan are counted under: points in = stored + rejected."""
-    lost = Counter(counted.rejected) + Counter(scan.ignored)
-    points = {f"points_rejected.{reason}": num for reason, num in lost.items()}
+    points: dict[str, int] = {}
+    for reason, num in (*counted.rejected.items(), *scan.ignored.items()):
+        name = f"points_rejected.{reason}"
+        points[name] = points.get(name, 0) + num
     points["points_in"] = len(scan.points) + sum(scan.ignored.values())
     points["points_stored"] = counted.points_stored
     return points

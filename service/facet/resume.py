@@ -252,9 +252,8 @@ def _follow(
     envelopes = filter(is_replayed, _envelopes(resumed, files, dialects))
     said = time.monotonic()
     for batch in logged_cuts(envelopes, lambda: True):
-        for envelope in batch:
-            pipeline.insert(envelope)
-            resumed.num_scans += 1
+        pipeline.insert(*batch)
+        resumed.num_scans += len(batch)
         if batch.revision > first_revision:  # the others are in the checkpoint
             pipeline.update()
         if stop():

@@ -181,9 +181,11 @@ class Rivals:
         number, digest, _ = claim
         row, recent = self._row(number), self._recent[number.source]
         assert row is not None
-        if recent.digests[row].tobytes() != digest or self._is_refused(number):
+        is_other = recent.digests[row].tobytes() != digest
+        if is_other or self._is_refused(number):
             self._choose(number, digest)
-        recent.digests[row] = np.frombuffer(digest, np.uint8)
+        if is_other:
+            recent.digests[row] = np.frombuffer(digest, np.uint8)
         recent.is_placed[row] = True
         self._keep(number, envelope)
 

@@ -28,7 +28,7 @@ from facet.keeper import Keeper
 from facet.mapping.mapper import Mapper
 from facet.outgoing import Outgoing
 from facet.past import Past
-from facet.pipeline import Pipeline
+from facet.pipeline import AT_ONCE, Pipeline
 from facet.resume import Newest, Resumed, hold, note_newest
 from facet.robots import admission_of, dialects_of
 from facet.sinks.answers import Answers, CommandError
@@ -224,16 +224,17 @@ class Service:
         if not self._running.wait(timeout_s):
             return
         started = time.monotonic()
-        is_whole = True
-        for envelope in self._durable.take(timeout_s):
-            if time.monotonic() > self._stop_at:
-                self.account.settle(source_of(envelope), "not_applied")
-                is_whole = False
-                continue
-            note_newest(self._newest, envelope)
-            self._pipeline.insert(envelope)
+        taken, num = self._durable.take(timeout_s), 0
+        while num < len(taken) and time.monotonic() <= self._stop_at:
+            now = taken[num : num + AT_ONCE]
+            for envelope in now:
+                note_newest(self._newest, envelope)
+            self._pipeline.insert(*now)
+            num += len(now)
+        for envelope in taken[num:]:
+            self.account.settle(source_of(envelope), "not_applied")
         self._pipeline.go_on()
-        if is_whole and self._durable.taken_to is not None:
+        if num == len(taken) and self._durable.taken_to is not None:
             self._position = self._durable.taken_to
         if self._pipeline.is_stale and time.monotonic() <= self._stop_at:
             self.account.stages({"insert": (time.monotonic() - started) * 1e3})

@@ -160,7 +160,7 @@ def _insert(scans: list[Scan]) -> dict[str, float]:
     for turn in range(2):
         for scan in scans:
             stopwatch = Stopwatch()
-            ticks = quantise(scan, settings)
+            ticks = quantise([scan], settings)
             stopwatch("quantise")
             store.insert(ticks)
             stopwatch("store")
@@ -174,7 +174,7 @@ def _insert(scans: list[Scan]) -> dict[str, float]:
 def _insert_units(mapper: Mapper, scans: list[Scan]) -> dict[str, float]:
     points, runs, fresh = 0, 0, Mapper()
     for scan in scans:
-        ticks = quantise(scan, mapper.settings)
+        ticks = quantise([scan], mapper.settings)
         fresh.insert(scan)
         points += len(ticks.points)
         runs += 1 + int(np.any(np.diff(np.asarray(ticks.points) >> 10, axis=0), axis=1).sum())

@@ -29,7 +29,7 @@ def points_of(simulation: Simulation, observer: Observer) -> tuple[np.ndarray, n
         observer.watch(look)
         message = simulation.message(look)
         scan = project(message, simulation.reach_m) if isinstance(message, LineFan) else message
-        ticks = quantise(scan, settings)
+        ticks = quantise([scan], settings)
         points.append((ticks.points * settings.tick_m).astype(np.float32))
         views.append(ticks.views.astype(np.int8))
     return np.concatenate(points), np.concatenate(views)

@@ -75,7 +75,7 @@ def _passes(looks: Looks) -> list[np.ndarray[Any, np.dtype[np.float64]]]:
         rows = []
         for scan in list(looks.scans(draw=draw)):
             marks = [time.perf_counter()]
-            ticks = quantise(scan, settings)
+            ticks = quantise([scan], settings)
             marks.append(time.perf_counter())
             store.insert(ticks)
             marks.append(time.perf_counter())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -113,7 +114,7 @@ def replay_log(
     mapper = make_mapper(config, recorded_settings(head))
     load_loops(mapper.settings)
     account = Account()
-    from facet.pipeline import Pipeline
+    from facet.pipeline import AT_ONCE, Pipeline
 
     pipeline = Pipeline(
         mapper,
@@ -123,18 +124,17 @@ def replay_log(
         Outgoing(config.map.id, config.map.frame),
         POINTS_EVERY_NS if points else 0,
     )
-    started, times = time.monotonic(), _LogTimes()
+    started, times, num = time.monotonic(), _LogTimes(), 0
     envelopes = times.watch(filter(is_replayed, recording))
     if speed:
         envelopes = paced(envelopes, speed, time.monotonic_ns, time.sleep)
-    num = 0
     for batch in _batches(envelopes, update_every, recording):
-        for envelope in batch:
-            if is_input(envelope):
-                account.arrive(source_of(envelope))
-            pipeline.insert(envelope)
-            num += is_scan(envelope)
-            on_scan(num)
+        for source, count in Counter(map(source_of, filter(is_input, batch))).items():
+            account.arrive(source, count)
+        for start in range(0, len(batch), AT_ONCE):
+            part = batch[start : start + AT_ONCE]
+            pipeline.insert(*part)
+            on_scan(num := num + sum(map(is_scan, part)))
         pipeline.update()
     pipeline.finish()
     for sink in sinks:

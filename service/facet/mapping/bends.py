@@ -22,9 +22,10 @@ from facet.mapping.kernel import kernel
 from facet.mapping.merging import Nodes
 from facet.mapping.normals import UNIT, NormalField
 from facet.mapping.patches import PatchField
-from facet.mapping.planes import FREE, Table
+from facet.mapping.planes import FREE
 from facet.mapping.settings import STEPS, TILE, MapSettings
 from facet.mapping.store import VoxelStore, centroid
+from facet.mapping.table import Table
 from facet.mapping.tiles import TileField
 
 SUMS = 22  # n; sum x (3), xx (6); sum u (3), u x (9): x in 1/8 voxels, u normals times UNIT

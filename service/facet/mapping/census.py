@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -29,13 +29,14 @@ class Census:
         self._points_stored = 0
         self._rejected: dict[str, int] = {}
 
-    def count(self, scan: Scan, ticks: Ticks, sign: int) -> None:
-        """Account for one scan inserted (1) or retracted (-1): every point stored or rejected."""
-        self._scans += sign
-        self._points_in += sign * len(scan.points)
+    def count(self, scans: Sequence[Scan], ticks: Ticks, sign: int) -> None:
+        """Account for scans inserted (1) or retracted (-1): every point stored or rejected."""
+        self._scans += sign * len(scans)
+        self._points_in += sign * sum(len(scan.points) for scan in scans)
         self._points_stored += sign * len(ticks.points)
-        for reason, number in ticks.rejected.items():
-            self._rejected[reason] = self._rejected.get(reason, 0) + sign * number
+        for rejected in ticks.rejected:
+            for reason, number in rejected.items():
+                self._rejected[reason] = self._rejected.get(reason, 0) + sign * number
 
     def freeze(self) -> dict[str, Any]:
         """What was counted, as JSON."""

@@ -29,21 +29,19 @@ FLAT_COS = 0.95  # planes that all are so near to one differ by less from one an
 NX, NY, NZ, OFFSET, WEIGHT = range(5)  # a candidate's plane: unit normal, offset; of its size
 LOW, HIGH = 5, 8  # its box: least and largest x, y, z
 OFF = 11  # distance of the voxel in turn from the plane
-COLUMNS = 12
-
-
-NEAR, MOST = 27 * PER_BLOCK, 125 * PER_BLOCK  # patches of a block and those beside it; and of those
+FACTS = 12
+NEAR, FAR = 27 * PER_BLOCK, 125 * PER_BLOCK  # patches of a block and those beside it; and of those
 # two away
 CLAIMS = np.dtype(  # scratch of one thread: patches that may claim the voxels of a block, N near
     # ones, C with those two blocks away; and the V voxels
     [
-        ("codes", np.int16, (MOST,)),  # (C,) 16 * neighbour + index
-        ("columns", np.float64, (COLUMNS, MOST)),  # (COLUMNS, C) eighths, from the corner of the
+        ("codes", np.int16, (FAR,)),  # (C,) 16 * neighbour + index
+        ("columns", np.float64, (FACTS, FAR)),  # (FACTS, C) eighths, from the corner of the
         # block that asks
         ("own", np.int64, (PER_BLOCK,)),  # which of them is the block's own patch, -1: none
         ("angled", np.int16, (NEAR, NEAR)),  # (N, N) for each the near ones at an angle to it
         ("num_angled", np.int64, (NEAR,)),  # (N,) how many these are, -1: not looked up yet
-        ("parallel", np.int16, (NEAR, MOST)),  # (N, C) for each near one those parallel to it
+        ("parallel", np.int16, (NEAR, FAR)),  # (N, C) for each near one those parallel to it
         ("num_parallel", np.int64, (NEAR,)),  # (N,) likewise
         ("waiting", np.int64, (NEAR,)),  # those that need another jamb
         ("costs", np.float64, (NEAR,)),  # of these
@@ -292,16 +290,9 @@ def _label_all(blocks, observable, patches, which, tolerance, scratches, changed
         for start in range(share * CHUNK, which.shape[0], step):
             stop = min(which.shape[0], start + CHUNK)
             _label_some(
-                blocks,
-                observable,
-                patches,
-                which,
-                start,
-                stop,
-                tolerance,
-                scratches[share],
+                blocks, observable, patches, which, start, stop, tolerance, scratches[share],
                 changed,
-            )
+            )  # fmt: skip
 
 
 @kernel(allocates=False)

@@ -17,9 +17,10 @@ from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.merging import NARROW
 from facet.mapping.normals import UNIT
-from facet.mapping.planes import ENOUGH_POINTS, FREE, PlaneSet, PointFit, Table, pool_points
+from facet.mapping.planes import ENOUGH_POINTS, FREE, PlaneSet, PointFit, pool_points
 from facet.mapping.settings import STEPS, MapSettings
 from facet.mapping.store import centroid
+from facet.mapping.table import Table
 
 CUT = 11  # origin (3), 1/8 voxels; unit vectors away from the plane's bulk (3) and along its end
 # (3), times UNIT; how far beyond members may be, and half the end's length, 1/8 voxels
@@ -269,8 +270,8 @@ def find_ends(
     num, mean, scatter = pool_points(table, bent, held, count)
     unit = np.zeros((count, 3))
     np.add.at(unit, bent[held], table.nodes.unit[held])
-    edges = np.concatenate([table.edges, table.edges[:, ::-1]])
-    edges = edges[held[edges[:, 0]]]
+    one, other = held[table.edges].T
+    edges = np.concatenate([table.edges[one], table.edges[other, ::-1]])
     touching = _touching(planes.label, bent, edges)
     cuts = _cuts(
         num, mean, scatter, unit, bent[edges[held[edges[:, 1]]]], touching.pairs,

@@ -86,9 +86,16 @@ def _blocks_apart(a, b):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _pass_all(table, counts, keys, num_blocks, sensor, points, start, every, sign, ends):  # type: ignore[no-untyped-def]
-    """Follow the chosen beams from `start` on. Returns (next beam, number of blocks)."""
+def _pass_all(table, counts, keys, num_blocks, scans, points, starts, start, sign, ends):  # type: ignore[no-untyped-def]
+    """Follow the chosen beams from `start` on, those of scans (S,) with (sensors, pose_hashes)
+    beginning at starts (S + 1,). Returns (next beam, number of blocks)."""
+    sensors, pose_hashes = scans
+    scan, every = -1, 1
     for p in range(start, points.shape[0]):
+        while p >= starts[scan + 1]:
+            scan += 1
+            every = BEAMS_OF if pose_hashes[scan] < 0 else 1
+        sensor = sensors[scan]
         mixed = hash_key(
             points[p, 0] * 73856093 ^ points[p, 1] * 19349663 ^ points[p, 2] * 83492791
         )
@@ -147,11 +154,11 @@ class FreeSpace:
         self.num_blocks = len(keys)
 
     def insert(self, ticks: Ticks) -> None:
-        """Count a scan's beams."""
+        """Count the beams of scans."""
         self._apply(ticks, 1)
 
     def remove(self, ticks: Ticks) -> None:
-        """Take a scan's beams out again."""
+        """Take the beams of scans out again."""
         self._apply(ticks, -1)
 
     def passed_all(self, points: Int64Array, least: int) -> int:
@@ -168,13 +175,14 @@ class FreeSpace:
         return keys[order], self._counts[block, local][order]
 
     def _apply(self, ticks: Ticks, sign: int) -> None:
-        every = BEAMS_OF if ticks.pose_hash < 0 else 1
-        for points, ends in ((ticks.points, True), (ticks.beams, False)):
+        scans = ticks.sensors, ticks.pose_hashes
+        hits, empty = (ticks.points, ticks.starts, True), (ticks.beams, ticks.beam_starts, False)
+        for points, starts, ends in (hits, empty):
             done = 0
             while done < len(points):
                 done, self.num_blocks = _pass_all(
-                    self._table, self._counts, self._keys, self.num_blocks, ticks.sensor,
-                    points, done, every, sign, ends,
+                    self._table, self._counts, self._keys, self.num_blocks, scans,
+                    points, starts, done, sign, ends,
                 )  # fmt: skip
                 if done < len(points):
                     self._grow()

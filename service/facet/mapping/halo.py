@@ -2,7 +2,7 @@
 
 The surroundings are kept as rows along x, one for each (y, z): a bit mask of the occupied voxels
 and where in the gathered list the row starts. What a cubic region holds is then a handful of short
-runs of that list.
+runs of that list. Of a wall across x it would be many, of a voxel each: then rows lie along y.
 """
 
 from __future__ import annotations
@@ -31,9 +31,10 @@ HALO = np.dtype(  # scratch of one thread: the surroundings of one block at a ti
         ("poses", np.int32, (EDGE**3,)),  # likewise, the high halves of their observables
         ("words", np.int32, (EDGE**3,)),  # likewise, the low halves
         ("places", np.int32, (EDGE**3,)),  # likewise, packed
-        ("rows", np.uint64, (EDGE**2,)),  # a bit per x of the row (z, y), y fastest
+        ("along_y", np.int8, (1,)),  # whether rows are
+        ("rows", np.uint64, (EDGE**2,)),  # a bit per x of the row (z, y), y fastest; or x for y
         ("first", np.int32, (EDGE**2,)),  # where the row starts in the list
-        ("filled", np.uint64, (EDGE,)),  # a bit per y of the rows at z: it holds a voxel
+        ("filled", np.uint64, (EDGE,)),  # a bit per y (or x) of the rows at z: it holds a voxel
         ("near", np.int32, (SIDE_BLOCKS**3,)),  # blocks, -1: none
     ],
     align=True,
@@ -64,9 +65,33 @@ def find_near(blocks, block, blocks_out, near):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def fill_rows(masks, near, blocks_out, margin, rows):  # type: ignore[no-untyped-def]
+def _transposed(word):  # type: ignore[no-untyped-def]
+    """Bits x + 8 y as y + 8 x (Warren, Hacker's Delight, 7-3)."""
+    t = (word ^ (word >> np.uint64(7))) & np.uint64(0x00AA00AA00AA00AA)
+    word = word ^ t ^ (t << np.uint64(7))
+    t = (word ^ (word >> np.uint64(14))) & np.uint64(0x0000CCCC0000CCCC)
+    word = word ^ t ^ (t << np.uint64(14))
+    t = (word ^ (word >> np.uint64(28))) & np.uint64(0x00000000F0F0F0F0)
+    return word ^ t ^ (t << np.uint64(28))
+
+
+@kernel(allocates=False)
+def _is_across_x(bits):  # type: ignore[no-untyped-def]
+    """Whether the voxels of a block, bits (8,), fill fewer rows along y than along x."""
+    more = 0
+    for z in range(8):
+        other = _transposed(bits[z])
+        for n in range(8):
+            byte = np.uint64(255) << np.uint64(8 * n)
+            more += (bits[z] & byte) != np.uint64(0)
+            more -= (other & byte) != np.uint64(0)
+    return more > 0
+
+
+@kernel(allocates=False)
+def fill_rows(masks, near, blocks_out, margin, along_y, rows):  # type: ignore[no-untyped-def]
     """Bits of masks (B, 8), voxels up to `margin` beyond the middle one of the blocks `near`, as
-    rows along x: bit 0 lies at x = -margin."""
+    rows along x: bit 0 lies at x = -margin. Or as rows along y, for each x."""
     width = 2 * blocks_out + 1
     edge = BLOCK + 2 * margin
     all_bits = (np.uint64(1) << np.uint64(edge)) - np.uint64(1)
@@ -77,15 +102,54 @@ def fill_rows(masks, near, blocks_out, margin, rows):  # type: ignore[no-untyped
             continue
         shift = BLOCK * (n % width - blocks_out) + margin
         y0 = BLOCK * ((n // width) % width - blocks_out) + margin  # of its first row
+        if along_y:
+            shift, y0 = y0, shift
         z0 = BLOCK * (n // (width * width) - blocks_out) + margin
         for z in range(max(0, -z0), min(BLOCK, edge - z0)):
             word = masks[other, z]
             if word == np.uint64(0):
                 continue
+            if along_y:
+                word = _transposed(word)
             for y in range(max(0, -y0), min(BLOCK, edge - y0)):
                 byte = (word >> np.uint64(8 * y)) & np.uint64(255)
                 byte = byte << np.uint64(shift) if shift >= 0 else byte >> np.uint64(-shift)
                 rows[(z0 + z) * edge + y0 + y] |= byte & all_bits
+
+
+@kernel(allocates=False, inlined=True)
+def _list_along_x(blocks, halo, near, width, y, z, margin, row, count):  # type: ignore[no-untyped-def]
+    """List the voxels of a row along x, its bits: their rows, for now, as words. near: place in
+    halo.near of the block at x, y of the middle one and z of the row. Returns how many there are
+    now."""
+    near += width * (y >> 3)
+    inside, cell, voxels = 8 * (z & 7) + (y & 7), np.int64(-99), blocks.rows[0]
+    while row != np.uint64(0):
+        bit = np.int64(trailing_zeros(row))
+        row &= row - np.uint64(1)
+        x = bit - margin
+        if x >> 3 != cell:  # into the next block
+            cell = x >> 3
+            voxels = blocks.rows[blocks.lines[halo.near[near + cell], inside]]
+        halo.words[count] = voxels[x & 7] - 1
+        halo.places[count] = bit | ((y + margin) << 8) | ((z + margin) << 16)
+        count += 1
+    return count
+
+
+@kernel(allocates=False, inlined=True)
+def _list_along_y(blocks, halo, near, width, x, z, margin, row, count):  # type: ignore[no-untyped-def]
+    """Likewise those of a row along y."""
+    near += x >> 3
+    while row != np.uint64(0):
+        bit = np.int64(trailing_zeros(row))
+        row &= row - np.uint64(1)
+        y = bit - margin
+        line = blocks.lines[halo.near[near + width * (y >> 3)], 8 * (z & 7) + (y & 7)]
+        halo.words[count] = blocks.rows[line, x & 7] - 1
+        halo.places[count] = (x + margin) | (bit << 8) | ((z + margin) << 16)
+        count += 1
+    return count
 
 
 @kernel(allocates=False)
@@ -94,9 +158,11 @@ def gather(blocks, observable, block, margin, halo):  # type: ignore[no-untyped-
     blocks_out = (margin + 7) >> 3
     width = 2 * blocks_out + 1
     edge = BLOCK + 2 * margin
+    along_y = _is_across_x(blocks.occupied[block])
     find_near(blocks, block, blocks_out, halo.near)
-    fill_rows(blocks.occupied, halo.near, blocks_out, margin, halo.rows)
+    fill_rows(blocks.occupied, halo.near, blocks_out, margin, along_y, halo.rows)
     words, poses, places = halo.words, halo.poses, halo.places
+    halo.along_y[0] = along_y
     halo.filled[:edge] = np.uint64(0)
     count = 0
     for line in range(edge * edge):
@@ -105,20 +171,12 @@ def gather(blocks, observable, block, margin, halo):  # type: ignore[no-untyped-
         if row == np.uint64(0):
             continue
         halo.filled[line // edge] |= np.uint64(1) << np.uint64(line % edge)
-        y, z = line % edge - margin, line // edge - margin
-        start = width * ((y >> 3) + blocks_out) + width * width * ((z >> 3) + blocks_out)
-        inside, cell, voxels = 8 * (z & 7) + (y & 7), np.int64(-99), blocks.rows[0]
-        place = ((y + margin) << 8) | ((z + margin) << 16)
-        while row != np.uint64(0):
-            bit = np.int64(trailing_zeros(row))
-            row &= row - np.uint64(1)
-            x = bit - margin
-            if x >> 3 != cell:  # into the next block
-                cell = x >> 3
-                voxels = blocks.rows[blocks.lines[halo.near[start + cell + blocks_out], inside]]
-            words[count] = voxels[x & 7] - 1
-            places[count] = place | bit
-            count += 1
+        u, z = line % edge - margin, line // edge - margin
+        near = width * (width * ((z >> 3) + blocks_out) + blocks_out) + blocks_out
+        if along_y:
+            count = _list_along_y(blocks, halo, near, width, u, z, margin, row, count)
+        else:
+            count = _list_along_x(blocks, halo, near, width, u, z, margin, row, count)
     for i in range(count):  # one look-up at a time for all: they do not wait for one another
         seen = observable[words[i]]
         words[i] = seen
@@ -146,6 +204,8 @@ def take(halo, margin, x, y, z, r, most, poses_too, votes, poses):  # type: igno
     votes (>= COLUMNS, >= most + LANES), and to poses (most,) if `poses_too`. Returns how many; what
     lies behind them means nothing."""
     edge = BLOCK + 2 * margin
+    if halo.along_y[0] != 0:
+        x, y = y, x
     low, first_y = np.uint64(x + margin - r), y + margin - r
     cube = (np.uint64(1) << np.uint64(2 * r + 1)) - np.uint64(1)
     before = (np.uint64(1) << low) - np.uint64(1)

@@ -13,10 +13,11 @@ from facet.mapping.blocks import CENTRE, find, pack_all, unpack, unpack_all
 from facet.mapping.digest import derived_digest, model_planes
 from facet.mapping.kernel import kernel
 from facet.mapping.normals import EMPTY, VALID
+from facet.mapping.observable import observe
 from facet.mapping.planes import FREE
 from facet.mapping.quantise import VIEW
 from facet.mapping.settings import BLOCK, TICKS
-from facet.mapping.store import VoxelStore, observe
+from facet.mapping.store import VoxelStore
 from facet.mapping.sums import TOUCHED
 from facet_protocol.messages import Plane
 

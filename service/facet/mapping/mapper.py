@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -23,17 +24,20 @@ from facet.mapping.memory import Heap, Memory
 from facet.mapping.merging import limits
 from facet.mapping.normals import NormalField
 from facet.mapping.patches import PatchField
-from facet.mapping.planes import FREE, PointFit, fit_points, group_planes, tabulate
+from facet.mapping.planes import FREE, PointFit, fit_points, group_planes
 from facet.mapping.quantise import quantise
 from facet.mapping.report import MapCounts, StageReport
 from facet.mapping.settings import TICKS, MapSettings
 from facet.mapping.store import Touched, VoxelStore
+from facet.mapping.table import Tabulator
 from facet.mapping.tiles import TileField
 from facet.mapping.witness import Witness
 from facet_protocol.messages import MapUpdate, Scan, TilePoints
 
 Timer = Callable[[str], None]
 TileIndex = tuple[int, int, int]
+MANY = 4096  # points from which on their beams are followed beside, on another core
+_BESIDE = ThreadPoolExecutor(1, "beams")
 
 
 class Counted(NamedTuple):
@@ -84,27 +88,37 @@ class Mapper:
         self._witness = Witness()
         self._census = Census()
         self._told = Told.nothing()
-        self._table = tabulate({})
+        self._tabulator = Tabulator()
+        self._table = self._tabulator.tabulate({})
         self._planes = group_planes(self._table, limits(self.settings, 0.0), self.settings)
         self._stamp_ns = 0
 
     def insert(self, scan: Scan) -> Counted:
         """Add a resolved scan. What cannot be mapped is counted, never lost in silence."""
-        ticks = quantise(scan, self.settings)
-        self._store.insert(ticks)
-        self._free.insert(ticks)
-        self._witness.note(ticks, scan)
-        self._census.count(scan, ticks, 1)
-        self._stamp_ns = max(self._stamp_ns, scan.stamp_ns)
-        return Counted(len(ticks.points), ticks.rejected)
+        return self.insert_all((scan,))[0]
+
+    def insert_all(self, scans: Sequence[Scan]) -> list[Counted]:
+        """Add resolved scans, of whichever robots, all at once."""
+        ticks = quantise(scans, self.settings)
+        if len(ticks.points) >= MANY:
+            beams = _BESIDE.submit(self._free.insert, ticks)
+            self._store.insert(ticks)
+            beams.result()
+        else:
+            self._store.insert(ticks)
+            self._free.insert(ticks)
+        self._witness.note(ticks, scans)
+        self._census.count(scans, ticks, 1)
+        self._stamp_ns = max(self._stamp_ns, *(scan.stamp_ns for scan in scans))
+        return [*map(Counted, np.diff(ticks.starts).tolist(), ticks.rejected)]
 
     def retract(self, scan: Scan) -> Counted:
         """Take a scan out again, exactly as if it had never been there (design 3.7)."""
-        ticks = quantise(scan, self.settings)
+        ticks = quantise((scan,), self.settings)
         self._store.remove(ticks)
         self._free.remove(ticks)
-        self._census.count(scan, ticks, -1)
-        return Counted(len(ticks.points), ticks.rejected)
+        self._census.count((scan,), ticks, -1)
+        return Counted(len(ticks.points), ticks.rejected[0])
 
     def update(self, timer: Timer | None = None) -> MapUpdate:
         """Derive everything that is stale. `timer` is told the name of each stage as it ends."""
@@ -115,7 +129,7 @@ class Mapper:
         done("settle")
         num_stale, turned = self._normals.update(store, dirty)
         done("normals")
-        moved = np.unique(store.columns.block[dirty.rows])
+        moved = store.blocks_of(dirty.rows)
         grouped = self.group(np.union1d(turned, moved), moved, touched, done)
         lineage = self._identity.assign(len(grouped.points.total), self._heritage())
         updated = self.outline(lineage.ids, grouped, done)
@@ -152,8 +166,9 @@ class Mapper:
     ) -> Grouped:
         """Planes from normals: group again what blocks with changed normals (`turned`), changed
         centroids (`moved`) and voxels with changed moments (`touched`) make stale."""
+        seen = self._store.blocks_of(touched.rows)
         regrouped, relabelled = self._patches.update(
-            self._store, self._normals.normals, turned, touched.rows
+            self._store, self._normals.normals, turned, seen
         )
         done("patches")
         limit = limits(self.settings, self._patches.sigma() / TICKS)
@@ -166,11 +181,12 @@ class Mapper:
             relabelled,
             turned,
             moved,
+            seen,
             touched,
         )
         self._bends.forget(stirred)
         done("tiles")
-        self._table = tabulate(self._tiles.tiles)
+        self._table = self._tabulator.tabulate(self._tiles.tiles)
         self._planes = group_planes(self._table, limit, self.settings, self._bends.flat)
         points = fit_points(self._table, self._planes, self.settings.voxel_m)
         ends = find_ends(self._table, self._planes, self._bends.bent, points, self.settings)

@@ -20,6 +20,8 @@ C = TypeVar("C", bound=tuple[Any, ...])
 class Memory(Protocol):
     """Room for columns."""
 
+    growth: int  # how many times as long a full column becomes
+
     def grown(self, column: Column, used: int, capacity: int) -> Column:
         """A column (capacity, ...) with the first `used` rows of `column`, zeros behind them. The
         old one is not to be used again."""
@@ -30,6 +32,8 @@ class Memory(Protocol):
 
 class Heap:
     """Plain memory. What was not written yet takes none."""
+
+    growth = 4  # a copy is dearer than room that is not used
 
     def grown(self, column: Column, used: int, capacity: int) -> Column:
         """A copy, see `Memory`."""

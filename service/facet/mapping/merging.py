@@ -147,11 +147,12 @@ def _edge_costs(votes, mean, unit, normals, narrow, edges, limit):  # type: igno
         a, b = edges[e, 0], edges[e, 1]
         if votes[b] > votes[a]:
             a, b = b, a
+        costs[e] = np.inf
         cos = _best_cos(normals, narrow, unit, a, b)
+        if cos < limit.edge_cos:  # most of them
+            continue
         w = abs(_offset(normals, mean, a, b))
-        if cos < limit.edge_cos or w > limit.offset:
-            costs[e] = np.inf
-        else:
+        if w <= limit.offset:
             costs[e] = (1.0 - cos) / (1.0 - limit.edge_cos) + (w / limit.offset) ** 2
     return costs
 

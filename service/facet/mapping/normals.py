@@ -43,7 +43,7 @@ from facet.mapping.traces import (
 )
 
 CLASS_NAMES = ("empty", "valid", "aligned", "thick", "sparse", "mixed")
-NARROW, WIDE = 4, 8  # voxels that the first and the second halo of a block reach beyond it
+MARGINS = (5, 8, 12)  # voxels that the halos of a block reach beyond it, one after the other
 SHARES = 16  # parts that the blocks are dealt out to; threads take them
 RUN = 16  # blocks, beside one another in memory, that fall to the same share
 
@@ -108,18 +108,26 @@ def _estimate_block(  # type: ignore[no-untyped-def]
             at = halo, margin, local, seen, rule
             kind, nx, ny, nz, gamma, border, reach = estimate(at, scratch)
             if kind == WIDER:
-                wider = NARROW if margin < NARROW else WIDE if margin < WIDE else rule.largest
-                margin = min(wider, rule.largest)
+                margin = _wider(margin, rule.largest)
                 gather(blocks, observable, block, margin, halo)
         found[count, 0], found[count, 1], found[count, 2], found[count, 3] = kind, nx, ny, nz
         found[count, 4], found[count, 5], found[count, 6] = gamma, border, reach
         if num_changes < 0:
             forget(traces, share, row)
         else:
-            keep(traces, share, row, scratch)
+            keep(traces, share, row, starts[v], scratch)
         rows[count] = row
         count += 1
     return _write(normals, rows, count, found)
+
+
+@kernel(allocates=False)
+def _wider(margin, largest):  # type: ignore[no-untyped-def]
+    """The margin of the next halo."""
+    for wider in MARGINS:
+        if margin < wider:
+            return min(np.int64(wider), largest)
+    return largest
 
 
 @kernel(allocates=False)

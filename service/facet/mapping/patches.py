@@ -255,14 +255,13 @@ class PatchField:
         store: VoxelStore,
         normals: Normals,
         dirty: NDArray[np.int32],
-        touched_rows: NDArray[np.int32],
+        seen: NDArray[np.int32],
     ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
         """Group the blocks `dirty` again (normals or observables changed) and sum the points of
-        the blocks of `touched_rows`.
+        the blocks `seen`.
 
         Returns blocks: (patches changed), (labels changed)."""
         self._fit(store)
-        block_of = store.columns.block
         changed, shows = np.empty(len(dirty), np.bool_), np.empty(len(dirty), np.bool_)
         sources = store.blocks, store.columns.observable, normals, self.patches
         if len(dirty) < FEW:
@@ -277,10 +276,8 @@ class PatchField:
             self._claims, relabelled,
         )  # fmt: skip
         relabelled_blocks = near[relabelled]
-        touched = np.union1d(block_of[touched_rows], np.union1d(dirty, relabelled_blocks))
-        read_rungs(
-            store.blocks, store.columns, normals.border, self.patches, touched, self.histogram
-        )
+        other = np.union1d(seen, np.union1d(dirty, relabelled_blocks))
+        read_rungs(store.blocks, store.columns, normals.border, self.patches, other, self.histogram)
         return dirty[changed], relabelled_blocks
 
     def _around(self, store: VoxelStore, blocks: NDArray[np.int32]) -> NDArray[np.int32]:

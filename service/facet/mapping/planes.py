@@ -17,29 +17,15 @@ from numpy.typing import NDArray
 from facet.mapping.blocks import unpack_all
 from facet.mapping.kernel import kernel
 from facet.mapping.merging import Limits, Nodes, merge_nodes, plane_of, pool
-from facet.mapping.runs import starts_of
 from facet.mapping.settings import TICKS, TILE, MapSettings
-from facet.mapping.tile import Tile, edges_of
+from facet.mapping.table import Table
 
 FREE = -1
 ADOPTIONS = 10  # rounds in which freed tile-planes are offered to the planes beside them
 ENOUGH_POINTS = 200  # pure points that a plane is fitted to
 
 
-Judge = Callable[["Table", NDArray[np.int64], Nodes, NDArray[np.int64]], NDArray[np.bool_]]
-
-
-class Table(NamedTuple):
-    """All tile-planes in canonical order: by tile key, then by their order in the tile."""
-
-    tile_keys: NDArray[np.int64]  # (L,) ascending
-    starts: NDArray[np.int64]  # (L + 1,) first node of each tile
-    nodes: Nodes  # (T, ...)
-    occupation: NDArray[np.int64]  # (T,) voxels
-    edges: NDArray[np.int64]  # (E, 2) adjacent nodes, ascending
-    points: NDArray[np.int64]  # (T, 10) exact moments of pure points about the tile corner
-    total: NDArray[np.int64]  # (T,) points of all members
-    tile_of: NDArray[np.int64]  # (T,) index into tile_keys
+Judge = Callable[[Table, NDArray[np.int64], Nodes, NDArray[np.int64]], NDArray[np.bool_]]
 
 
 @dataclass(slots=True)
@@ -64,30 +50,6 @@ class PlaneSet:
     nodes: Nodes  # (K, ...) statistics of the voxels
     occupation: NDArray[np.int64]  # (K,) voxels
     stages: Stages
-
-
-def tabulate(tiles: dict[int, Tile]) -> Table:
-    """Concatenate the tiles."""
-    keys = np.array(sorted(k for k, t in tiles.items() if t.num_planes), np.int64)
-    ordered = [tiles[int(k)] for k in keys]
-    counts = np.array([t.num_planes for t in ordered], np.int64)
-    starts = starts_of(counts)
-    if not ordered:
-        none = Nodes(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 6)), np.zeros((0, 3)))
-        empty = np.zeros(0, np.int64)
-        pairs, points = empty.reshape(0, 2), np.zeros((0, 10), np.int64)
-        return Table(keys, starts, none, empty, pairs, points, empty, empty)
-    nodes = Nodes(*(np.concatenate(c) for c in zip(*(t.nodes for t in ordered), strict=True)))
-    return Table(
-        keys,
-        starts,
-        nodes,
-        np.concatenate([t.occupation for t in ordered]),
-        edges_of(ordered, starts),
-        np.concatenate([t.points for t in ordered]),
-        np.concatenate([t.total for t in ordered]),
-        np.repeat(np.arange(len(ordered)), counts),
-    )
 
 
 def group_planes(
@@ -141,8 +103,9 @@ def detail_level(
 
 
 def _relabel(roots: NDArray[np.int64], merged: Nodes) -> tuple[NDArray[np.int64], Nodes]:
-    kept, label = np.unique(roots, return_inverse=True)
-    return label.astype(np.int64), Nodes(*(np.ascontiguousarray(c[kept]) for c in merged))
+    is_root = roots == np.arange(len(roots))
+    label = (np.cumsum(is_root) - 1)[roots]
+    return label, Nodes(*(np.ascontiguousarray(c[is_root]) for c in merged))
 
 
 def _drop(
@@ -197,30 +160,32 @@ def _fits(votes, mean, scatter, unit, t, normal, centre, limit):  # type: ignore
     return rms if rms <= limit.offset else -1.0
 
 
-@kernel
-def _adopt_along(votes, mean, scatter, unit, edges, label, normals, centres, limit):  # type: ignore[no-untyped-def]
-    """Offer free nodes to the planes of their neighbours, nearest first, until nothing changes."""
-    loose = np.empty((edges.shape[0], 2), np.int64)  # edges with a free end: the others offer none
+@kernel(allocates=False)
+def _adopt_along(nodes, edges, label, normals, centres, limit, room):  # type: ignore[no-untyped-def]
+    """Offer free nodes to the planes of their neighbours, nearest first, until nothing changes.
+
+    room: is_free (T,), which are; loose (E,), edges that may offer something yet; best (T,), FREE,
+    best_rms (T,), inf, and taken (T,)."""
+    votes, mean, scatter, unit = nodes
+    is_free, loose, best, best_rms, taken = room
     num = 0
-    for e in range(edges.shape[0]):
-        loose[num] = edges[e]
-        num += (label[edges[e, 0]] == FREE) | (label[edges[e, 1]] == FREE)
-    best = np.full(votes.shape[0], FREE, np.int64)
-    best_rms = np.full(votes.shape[0], np.inf)
-    taken = np.empty(votes.shape[0], np.int64)
+    for e in range(edges.shape[0]):  # an edge without a free end offers none
+        loose[num] = e
+        num += is_free[edges[e, 0]] | is_free[edges[e, 1]]
     for _ in range(ADOPTIONS):
         left, num_taken = 0, 0
-        for e in range(num):
-            t, other = loose[e, 0], loose[e, 1]
-            if label[t] != FREE:
-                t, other = other, t
-            p = label[other]
-            if p == FREE:  # both are free: perhaps later
-                loose[left] = loose[e]
+        for at in range(num):
+            e = loose[at]
+            t, other = edges[e, 0], edges[e, 1]
+            if is_free[t] and is_free[other]:  # perhaps later
+                loose[left] = e
                 left += 1
                 continue
-            if label[t] != FREE:  # neither is any more
+            if is_free[other]:
+                t, other = other, t
+            if not is_free[t]:  # neither is any more
                 continue
+            p = label[other]
             rms = _fits(votes, mean, scatter, unit, t, normals[p], centres[p], limit)
             if rms >= 0.0 and (rms < best_rms[t] or (rms == best_rms[t] and p < best[t])):
                 if best[t] == FREE:
@@ -229,6 +194,7 @@ def _adopt_along(votes, mean, scatter, unit, edges, label, normals, centres, lim
                 best[t], best_rms[t] = p, rms
         for at in range(num_taken):
             label[taken[at]] = best[taken[at]]
+            is_free[taken[at]] = False
         if num_taken == 0:
             break
         num = left
@@ -239,7 +205,10 @@ def _adopt(
 ) -> NDArray[np.int64]:
     label = label.copy()
     normals = _fits_of(nodes.votes, nodes.scatter, nodes.unit)[:, :3]
-    _adopt_along(*table.nodes, table.edges, label, normals, nodes.mean, limit)
+    size, num_edges = len(label), len(table.edges)
+    best, taken = np.full(size, FREE), np.empty(size, np.int64)
+    room = label == FREE, np.empty(num_edges, np.int32), best, np.full(size, np.inf), taken
+    _adopt_along(table.nodes, table.edges, label, normals, nodes.mean, limit, room)
     return label
 
 

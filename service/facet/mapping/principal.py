@@ -11,8 +11,8 @@ import numpy as np
 from facet.mapping.eigen import eigenvalues, eigenvector
 from facet.mapping.kernel import kernel
 
-LANES = 8  # sums side by side
-PLACES = 2 * LANES  # sums that there is room for
+ABREAST = 8  # sums side by side
+PLACES = 2 * ABREAST  # sums that there is room for
 LAMBDA, TAN_GAMMA, NX, NY, NZ, XX, YY, ZZ, XY, XZ, YZ = range(0, 11 * PLACES, PLACES)  # where what
 # they say, and their covariance, begins: one array, so that it is known that nothing overlaps
 PRINCIPAL = YZ + PLACES  # numbers of that array
@@ -55,7 +55,7 @@ def analyse(kept, e, floor2, principal):  # type: ignore[no-untyped-def]
 def analyse_all(kept, count, floor2, principal):  # type: ignore[no-untyped-def]
     """What the sums kept[:count] say, and what lies behind them up to a full set of lanes: that is
     nonsense, and as fast."""
-    lanes = (count + LANES - 1) // LANES * LANES
+    lanes = (count + ABREAST - 1) // ABREAST * ABREAST
     for e in range(lanes):
         a, b, c, d, f, g = _covariance(kept[e])
         principal[XX + e], principal[YY + e], principal[ZZ + e] = a, b, c

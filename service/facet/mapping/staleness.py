@@ -85,13 +85,17 @@ def find_stale(blocks, dirty, reach, block, deepest, common, near, lines, listed
     edge = BLOCK + 2 * margin
     blocks_out = (margin + 7) >> 3
     find_near(blocks, block, blocks_out, near)
-    fill_rows(dirty, near, blocks_out, margin, lines)
+    rest = np.uint64(0)  # voxels that are not dirty
+    for z in range(8):
+        stale[z] = dirty[block, z]
+        rest |= blocks.occupied[block, z] & ~stale[z]
+    if rest == np.uint64(0):
+        return _count(stale)
+    fill_rows(dirty, near, blocks_out, margin, False, lines)
     rows, places, reaches = listed[0], listed[1], listed[2]
     count = list_voxels(blocks, block, blocks.occupied[block], rows, places)
     for v in range(count):
         reaches[v] = reach[rows[v]]
-    for z in range(8):
-        stale[z] = dirty[block, z]
     last, seen = np.int64(-1), np.uint64(0)
     for v in range(count):
         r, line, bit = reaches[v], places[v] >> 3, places[v] & 7
@@ -104,9 +108,15 @@ def find_stale(blocks, dirty, reach, block, deepest, common, near, lines, listed
         cube = (np.uint64(1) << np.uint64(2 * r + 1)) - np.uint64(1)
         if (found >> np.uint64(bit + margin - r)) & cube != np.uint64(0):
             stale[line >> 3] |= np.uint64(1) << np.uint64(places[v] & 63)
+    return _count(stale)
+
+
+@kernel(allocates=False)
+def _count(bits):  # type: ignore[no-untyped-def]
+    """How many bits of a block (8,) are set."""
     number = 0
     for z in range(8):
-        number += np.int64(population(stale[z]))
+        number += np.int64(population(bits[z]))
     return number
 
 

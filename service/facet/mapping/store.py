@@ -25,8 +25,9 @@ from facet.mapping.blocks import (
 )
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory, copied, grow_all
-from facet.mapping.quantise import VIEW, Ticks
-from facet.mapping.settings import BLOCK, STEPS, TICKS
+from facet.mapping.observable import observe
+from facet.mapping.quantise import Ticks
+from facet.mapping.settings import BLOCK, STEPS
 from facet.mapping.sums import (
     DEEP,
     MOMENTS,
@@ -40,7 +41,6 @@ from facet.mapping.sums import (
     sums_of,
 )
 
-SETTLED = 64  # from so many points on a centroid is rounded to 1/4 voxel: it moves half as often
 NOTED = 1 << 15  # touched voxels whose sums before are noted: more come in no few scans
 
 
@@ -73,10 +73,12 @@ class Columns(NamedTuple):
 
 
 @kernel(allocates=False)
-def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched_rows, before):  # type: ignore[no-untyped-def]
-    """Add points from `start` on with `sign`; note the rows touched, and their sums before. Returns
-    (next point, what is used now: blocks, ...); next < N means that a capacity ran out and the
-    caller must grow and go on."""
+def _insert(blocks, columns, ticks, sign, start, used, touched_rows, before):  # type: ignore[no-untyped-def]
+    """Add the points of scans from `start` on with `sign`; note the rows touched, and their sums
+    before. Returns (next point, what is used now: blocks, ...); next < N means that a capacity ran
+    out and the caller must grow and go on."""
+    points, views, starts, pose_hashes = ticks
+    scan, pose_hash = -1, np.int64(-1)
     num_blocks, num_lines, num_rows, num_touched = used
     last_key = -1
     last_block = -1
@@ -84,11 +86,14 @@ def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched
     max_lines = blocks.rows.shape[0]
     max_rows = columns.block.shape[0]
     max_touched = touched_rows.shape[0]
-    for p in range(start, ticks.shape[0]):
+    for p in range(start, points.shape[0]):
         full = num_blocks == max_blocks or num_lines == max_lines
         if full or num_rows == max_rows or num_touched == max_touched:
             return p, (num_blocks, num_lines, num_rows, num_touched)
-        tx, ty, tz = ticks[p, 0], ticks[p, 1], ticks[p, 2]
+        while p >= starts[scan + 1]:
+            scan += 1
+            pose_hash = pose_hashes[scan]
+        tx, ty, tz = points[p, 0], points[p, 1], points[p, 2]
         i, j, k = tx >> 10, ty >> 10, tz >> 10
         key = pack(i >> 3, j >> 3, k >> 3)
         if key != last_key:
@@ -119,50 +124,7 @@ def _insert(blocks, columns, ticks, views, pose_hash, sign, start, used, touched
             h[0] += sign
             h[1] += sign * pose_hash
             h[2] += sign * pose_hash * pose_hash
-    return ticks.shape[0], (num_blocks, num_lines, num_rows, num_touched)
-
-
-@kernel(allocates=False)
-def _coarse(component):  # type: ignore[no-untyped-def]
-    """A component of a direction, in eighths: 1, 4 or 7 with its sign. The sign is what tells the
-    side of a surface; the rest mostly drifts with the sensor."""
-    size = abs(component)
-    eighths = np.int64(1)
-    if size >= 0.6875:
-        eighths = np.int64(7)
-    elif size >= 0.3125:
-        eighths = np.int64(4)
-    return eighths if component >= 0.0 else -eighths
-
-
-@kernel(allocates=False)
-def observe(moments, views, poses):  # type: ignore[no-untyped-def]
-    """A voxel's observable, 49 bits: centroid in eighths (4, 4, 4), from SETTLED points on in
-    quarters; votes min(n, 8) (4); direction towards the sensor, `_coarse` (5, 5, 5); mixed (1);
-    pose hash + 1 of its only pose (17). What only drifts as points come in is rounded coarsely:
-    each change makes some sixty neighbours stale."""
-    n = moments[0]
-    if n == 0:
-        return np.int64(0)
-    word = np.int64(0)
-    coarse = 2 if n >= SETTLED else 1
-    for axis in range(3):  # round half up, to 1/8 voxel, or to 1/4
-        eighths = (moments[1 + axis] * 16 + n * TICKS * coarse) // (2 * n * TICKS * coarse)
-        word |= (eighths * coarse) << (4 * axis)
-    word |= min(n, 8) << 12
-    vx, vy, vz = float(views[0]), float(views[1]), float(views[2])
-    length = np.sqrt((vx * vx + vy * vy) + vz * vz)
-    if length > 0.0:
-        word |= (_coarse(vx / length) + 8) << 16
-        word |= (_coarse(vy / length) + 8) << 21
-        word |= (_coarse(vz / length) + 8) << 26
-    else:
-        word |= (8 << 16) | (8 << 21) | (8 << 26)
-    if length < 0.5 * VIEW * n:  # seen from both sides
-        word |= np.int64(1) << 31
-    if poses[0] == n and n * poses[2] == poses[1] * poses[1]:
-        word |= (poses[1] // n + 1) << 32
-    return word
+    return points.shape[0], (num_blocks, num_lines, num_rows, num_touched)
 
 
 @kernel
@@ -305,11 +267,11 @@ class VoxelStore:
         self.num_voxels = int(np.count_nonzero(columns["observable"]))
 
     def insert(self, ticks: Ticks) -> None:
-        """Add a scan's points."""
+        """Add the points of scans."""
         self._apply(ticks, 1)
 
     def remove(self, ticks: Ticks) -> None:
-        """Take a scan's points out again: the exact inverse of `insert`."""
+        """Take the points of scans out again: the exact inverse of `insert`."""
         self._apply(ticks, -1)
 
     @property
@@ -334,6 +296,12 @@ class VoxelStore:
         new, gone = dirty.before == 0, self.columns.observable[dirty.rows] == 0
         self.num_voxels += int(np.count_nonzero(new)) - int(np.count_nonzero(gone))
         return dirty
+
+    def blocks_of(self, rows: NDArray[np.int32]) -> NDArray[np.int32]:
+        """Blocks that rows (V,) lie in, ascending, each once."""
+        is_one = np.zeros(self.num_blocks, np.bool_)
+        is_one[self.columns.block[rows]] = True
+        return np.flatnonzero(is_one).astype(np.int32)
 
     def voxel_keys(self, rows: NDArray[np.int32]) -> NDArray[np.int64]:
         """(V, 3) voxel indices of rows (V,)."""
@@ -361,23 +329,23 @@ class VoxelStore:
         return sums_of(self.columns, rows)[:, MOMENTS:]
 
     def _apply(self, ticks: Ticks, sign: int) -> None:
-        done = 0
+        own, done = (ticks.points, ticks.views, ticks.starts, ticks.pose_hashes), 0
         while done < len(ticks.points):
             used = (self.num_blocks, self.num_lines, self.num_rows, self._num_touched)
             done, used = _insert(
-                self.blocks, self.columns, ticks.points, ticks.views, ticks.pose_hash, sign,
-                done, used, self._touched_rows, self._before,
-            )  # fmt: skip
+                self.blocks, self.columns, own, sign, done, used, self._touched_rows, self._before
+            )
             self.num_blocks, self.num_lines, self.num_rows, self._num_touched = used
             self._grow()
 
     def _grow(self) -> None:
         if self.num_blocks == len(self.blocks.keys):
             self._grow_blocks(2 * self.num_blocks)
+        growth, rows = self._memory.growth, self.num_rows
         if self.num_lines == len(self.blocks.rows):
-            self._grow_lines(2 * self.num_lines)
-        if self.num_rows == len(self.columns.block):
-            self.columns = grow_all(self._memory, self.columns, self.num_rows, 2 * self.num_rows)
+            self._grow_lines(growth * self.num_lines)
+        if rows == len(self.columns.block):
+            self.columns = grow_all(self._memory, self.columns, rows, growth * rows)
         if self._num_touched == len(self._touched_rows):
             self._touched_rows = np.resize(self._touched_rows, 2 * self._num_touched)
 
@@ -396,4 +364,4 @@ class VoxelStore:
         self.blocks = self.blocks._replace(rows=rows)
 
 
-__all__ = ["MOMENTS", "Columns", "VoxelStore", "observe", "shift_moments"]
+__all__ = ["MOMENTS", "Columns", "VoxelStore", "shift_moments"]

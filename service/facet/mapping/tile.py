@@ -7,14 +7,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from facet.mapping.blocks import pack
 from facet.mapping.membership import CLAIMED, Runs
 from facet.mapping.merging import Nodes
 from facet.mapping.runs import starts_of
 from facet.mapping.sums import MOMENTS
-
-_STEPS = np.array([pack(n % 3, n // 3 % 3, n // 9) for n in range(27)], np.int64)
-_STEPS -= pack(1, 1, 1)  # from a tile's key to those round it
 
 
 @dataclass(slots=True)
@@ -76,17 +72,6 @@ class Tile:
     def owner(self) -> NDArray[np.int64]:
         """(M,) tile-plane of each row."""
         return np.repeat(np.arange(self.num_planes), np.diff(self.starts))
-
-
-def edges_of(tiles: list[Tile], starts: NDArray[np.int64]) -> NDArray[np.int64]:
-    """(E, 2) the adjacent tile-planes of all tiles, by ascending key, when those of tile n are
-    numbered from starts[n] on."""
-    keys = np.array([tile.key for tile in tiles], np.int64)
-    near = np.searchsorted(keys, keys[:, None] + _STEPS)  # (N, 27) places of the tiles round each
-    pairs = np.concatenate([tile.pairs for tile in tiles])
-    own = np.repeat(np.arange(len(tiles)), [len(tile.pairs) for tile in tiles])
-    other = near[own, (pairs >> 16) & 0xFFFF]
-    return np.stack([starts[own] + (pairs >> 32), starts[other] + (pairs & 0xFFFF)], axis=1)
 
 
 def empty_tile(key: int, blocks: NDArray[np.int32]) -> Tile:

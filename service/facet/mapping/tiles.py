@@ -80,10 +80,12 @@ class TileField:
         relabelled: NDArray[np.int32],
         turned: NDArray[np.int32],
         moved: NDArray[np.int32],
+        seen: NDArray[np.int32],
         touched: Touched,
     ) -> tuple[list[int], list[int], set[int]]:
         """Bring the tiles up to date. The arguments after `limits` are blocks: patches changed,
-        labels changed, normals or centroids changed, centroids changed; and voxels.
+        labels changed, normals or centroids changed, centroids changed, sums of points changed;
+        and voxels whose sums did.
 
         Returns tile keys: (tile-planes grown again, voxels of tile-planes changed, these or their
         normals changed)."""
@@ -94,11 +96,11 @@ class TileField:
             regroup = sorted(self._blocks)
         else:
             regroup = [int(k) for k in np.unique(tile_keys_of(keys[regrouped]))]
-        flags = _flag(store, relabelled, turned, moved, touched)
+        flags = _flag(store, relabelled, turned, moved, seen)
         into, replaced = self._grow(store, patches, regroup, limits, flags)
         others = np.unique(np.concatenate([regrouped, relabelled, moved]))
         changed = sorted(self._near(keys[others], np.array(regroup, np.int64)))
-        near = self._near(keys[np.unique(store.columns.block[touched.rows])])
+        near = self._near(keys[seen])
         stirred = {*changed, *self._near(keys[turned])}
         tiles = [self.tiles[key] for key in sorted(stirred | near)]
         sources = store.blocks, store.columns, normals.border, patches.patches.second
@@ -231,11 +233,11 @@ def _flag(
     relabelled: NDArray[np.int32],
     turned: NDArray[np.int32],
     moved: NDArray[np.int32],
-    touched: Touched,
+    seen: NDArray[np.int32],
 ) -> NDArray[np.uint8]:
     """(B,) what changed in blocks."""
     flags = np.zeros(len(store.blocks.keys), np.uint8)
-    flags[store.columns.block[touched.rows]] |= TOUCHED
+    flags[seen] |= TOUCHED
     flags[turned] |= LOOK
     flags[relabelled] |= COLLECT | LOOK
     flags[moved] |= LOOK | MOVED

@@ -163,15 +163,6 @@ def begin(state):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _find_record(traces, share, row):  # type: ignore[no-untyped-def]
-    """Where in its share the sums of a voxel begin, -1: it has none."""
-    start = np.int64(traces.slot[row]) - 1
-    if start >= 0 and traces.entries[share, start, OWNER] != row + 1:
-        return -1
-    return start
-
-
-@kernel(allocates=False)
 def find_records(traces, share, rows, count, starts):  # type: ignore[no-untyped-def]
     """Where the sums of each of the voxels rows[:count] begin, -1: it has none. One look-up at a
     time for all of them: they do not wait for one another."""
@@ -183,12 +174,18 @@ def find_records(traces, share, rows, count, starts):  # type: ignore[no-untyped
 
 
 @kernel(allocates=False)
+def _is_record(traces, share, row, start):  # type: ignore[no-untyped-def]
+    """Whether the sums of a voxel that began there are not overwritten by now."""
+    return start >= 0 and traces.entries[share, start, OWNER] == row + 1
+
+
+@kernel(allocates=False)
 def recall(traces, share, row, start, scratch):  # type: ignore[no-untyped-def]
     """Bring what is kept of a voxel, and began at `start`, to hand. Whether it is all that the last
     estimate asked for."""
     kept, state = scratch.kept, scratch.state
     begin(state)
-    if start < 0 or traces.entries[share, start, OWNER] != row + 1:  # overwritten by now
+    if not _is_record(traces, share, row, start):
         return False
     entries = traces.entries[share]
     state[KNOWN] = entries[start, NUMBER]
@@ -199,14 +196,14 @@ def recall(traces, share, row, start, scratch):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def keep(traces, share, row, scratch):  # type: ignore[no-untyped-def]
-    """Keep those sums at hand that were asked for."""
+def keep(traces, share, row, start, scratch):  # type: ignore[no-untyped-def]
+    """Keep those sums at hand that were asked for, in place of those that began at `start`."""
     kept, state = scratch.kept, scratch.state
     number = 0
     for e in range(state[KNOWN]):
         number += (state[USED] >> e) & 1
-    start = _find_record(traces, share, row)
-    if start < 0 or traces.entries[share, start, ROOM] < number:
+    is_there = _is_record(traces, share, row, start)
+    if not is_there or traces.entries[share, start, ROOM] < number:
         start = _begin_record(traces, share, row, number)
     entries = traces.entries[share]
     entries[start, NUMBER] = number
@@ -236,8 +233,8 @@ def _begin_record(traces, share, row, number):  # type: ignore[no-untyped-def]
 @kernel(allocates=False)
 def forget(traces, share, row):  # type: ignore[no-untyped-def]
     """Keep nothing of a voxel."""
-    start = _find_record(traces, share, row)
-    if start >= 0:
+    start = np.int64(traces.slot[row]) - 1
+    if _is_record(traces, share, row, start):
         traces.entries[share, start, OWNER] = 0
 
 

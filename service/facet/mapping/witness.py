@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -23,17 +23,19 @@ class Sighting:
     robots: set[str] = field(default_factory=set)
 
 
-@kernel
-def _tile_runs(ticks):  # type: ignore[no-untyped-def]
-    """Tile keys of points (N, 3) ticks, runs of equal ones shortened to one."""
-    out = np.empty(ticks.shape[0], np.int64)
+@kernel(allocates=False)
+def _tile_runs(points, starts, out, ends):  # type: ignore[no-untyped-def]
+    """Tile keys of points (N, 3) ticks of scans that begin at starts (S + 1,), runs of equal ones
+    shortened to one, into out (N,): those of each scan up to ends (S,)."""
     count = 0
-    for p in range(ticks.shape[0]):
-        key = pack(ticks[p, 0] >> 16, ticks[p, 1] >> 16, ticks[p, 2] >> 16)
-        if count == 0 or out[count - 1] != key:
-            out[count] = key
-            count += 1
-    return out[:count]
+    for s in range(ends.shape[0]):
+        last = np.int64(-1)
+        for p in range(starts[s], starts[s + 1]):
+            key = pack(points[p, 0] >> 16, points[p, 1] >> 16, points[p, 2] >> 16)
+            if key != last:
+                out[count] = last = key
+                count += 1
+        ends[s] = count
 
 
 class Witness:
@@ -43,10 +45,18 @@ class Witness:
         self._sightings: dict[int, Sighting] = {}
         self._fresh: set[int] = set()
 
-    def note(self, ticks: Ticks, scan: Scan) -> None:
-        """A scan saw the tiles of its points."""
-        keys = np.unique(_tile_runs(ticks.points)).tolist()
-        self._fresh.update(keys)
+    def note(self, ticks: Ticks, scans: Sequence[Scan]) -> None:
+        """Scans saw the tiles of their points."""
+        runs, ends = np.empty(len(ticks.points), np.int64), np.empty(len(scans), np.int64)
+        _tile_runs(ticks.points, ticks.starts, runs, ends)
+        start = 0
+        for scan, end in zip(scans, ends.tolist(), strict=True):
+            self._see(set(runs[start:end].tolist()), scan)
+            start = end
+
+    def _see(self, keys: set[int], scan: Scan) -> None:
+        """A scan saw these tiles."""
+        self._fresh |= keys
         for key in keys:
             seen = self._sightings.get(key)
             if seen is None:

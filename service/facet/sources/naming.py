@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from functools import lru_cache
+from typing import NamedTuple
 
 from facet_protocol import topics
 from facet_protocol.messages import Envelope, ProtocolError
@@ -47,27 +48,44 @@ def names_of(envelope: Envelope) -> tuple[str, str]:
 
 def source_of(origin: Envelope | str) -> str:
     """The same as one word, `robot/sensor`: the name a source is counted under."""
-    names = robot_and_sensor(origin) if isinstance(origin, str) else names_of(origin)
-    return "/".join(names)
+    if isinstance(origin, str):
+        return _nature(origin, "").source
+    return "/".join(names_of(origin)) if origin.rule else _nature(origin.key, "").source
+
+
+class _Nature(NamedTuple):
+    """What key and schema of a message say."""
+
+    source: str
+    is_correction: bool
+    is_scan: bool
+    is_own: bool  # what Facet itself derived, in its own log
+
+
+@lru_cache(maxsize=4096)  # likewise
+def _nature(key: str, schema: str) -> _Nature:
+    is_correction = topics.is_correction_key(key) or topics.is_erase_topic(key)
+    is_own = key.startswith("/facet/")
+    is_scan = schema in SCAN_SCHEMAS and not is_own and not is_correction
+    return _Nature("/".join(robot_and_sensor(key)), is_correction, is_scan, is_own)
 
 
 def is_scan(envelope: Envelope) -> bool:
     """Whether it is a scan: our own points (`/facet/points`) are clouds too, but no scans."""
-    if envelope.schema not in SCAN_SCHEMAS:
-        return False
-    return not _is_own(envelope) and not is_correction(envelope)
+    return _nature(envelope.key, envelope.schema).is_scan and not envelope.is_derived
 
 
 def is_correction(envelope: Envelope) -> bool:
     """Whether it moves scans that came before, or takes them out."""
-    return topics.is_correction_key(envelope.key) or topics.is_erase_topic(envelope.key)
+    return _nature(envelope.key, envelope.schema).is_correction
 
 
 def is_input(envelope: Envelope) -> bool:
     """Whether the map is made of it: a scan, or what says where its sensor is, or was."""
-    if is_scan(envelope) or is_correction(envelope):
+    nature = _nature(envelope.key, envelope.schema)
+    if is_scan(envelope) or nature.is_correction:
         return True
-    if _is_own(envelope):
+    if envelope.is_derived or nature.is_own:
         return False
     if envelope.schema in TRANSFORM_SCHEMAS:
         return True
@@ -88,8 +106,3 @@ def pose_frame(envelope: Envelope) -> str:
 def is_static(envelope: Envelope) -> bool:
     """Whether its transforms hold for ever: what ROS sends on tf_static."""
     return envelope.key.rpartition("/")[2] == "tf_static"
-
-
-def _is_own(envelope: Envelope) -> bool:
-    """What Facet itself derived, in its own log."""
-    return envelope.is_derived or envelope.key.startswith("/facet/")
