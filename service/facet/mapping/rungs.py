@@ -43,6 +43,20 @@ def _list_members(blocks, border, patches, block, members):  # type: ignore[no-u
 
 
 @kernel(allocates=False)
+def _fetch(columns, members, count):  # type: ignore[no-untyped-def]
+    """Look at the sums of all members, one look-up at a time: they do not wait for one another, as
+    they would one voxel after the other. What is returned says nothing."""
+    seen = np.int64(0)
+    for v in range(count):
+        row = members[0, v]
+        seen |= columns.low[row, 0] | columns.low[row, SUMS - 1]
+    for v in range(count):
+        row = members[0, v]
+        seen |= columns.middle[row, 0] | columns.flags[row]
+    return seen
+
+
+@kernel(allocates=False)
 def _add_points(columns, members, count, all_of_them, m, total, sums):  # type: ignore[no-untyped-def]
     """Sum the members' point moments about the block corner into m (P, 10): of all, or
     only of pure ones. Count the points of all members in total (P,)."""
@@ -83,6 +97,7 @@ def _read_some(blocks, columns, border, patches, which, start, stop, histogram):
     for q in range(start, stop):
         block = which[q]
         number = _list_members(blocks, border, patches, block, members)
+        members[0, VOXELS] = _fetch(columns, members, number)
         _add_points(columns, members, number, False, pure, total, sums)
         count = np.int64(patches.number[block])
         if np.any(PURE_SHARE * pure[:count, 0] < total[:count]):
