@@ -35,6 +35,18 @@ def test_an_update_after_each_scan_of_a_shuffled_log_gives_the_same_map(name: st
 
 
 @every_log
+def test_scans_put_in_together_are_as_each_alone(name: str) -> None:
+    whole = log(name).shuffled(8)
+    mapper, alone = Mapper(whole.settings), Mapper(whole.settings)
+    for start in range(0, len(whole.scans), 7):
+        some = whole.scans[start : start + 7]
+        assert mapper.insert_all(some) == [alone.insert(scan) for scan in some]
+    mapper.update()
+    assert mapper.digest() == truth_of(name)
+    mapper.check_invariants()
+
+
+@every_log
 @pytest.mark.parametrize("seed", [11, 12])
 def test_what_was_taken_out_was_never_there(name: str, seed: int) -> None:
     undoes(log(name), seed=seed).check_invariants()

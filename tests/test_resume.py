@@ -91,8 +91,9 @@ class Line:
         return taken
 
     def apply(self, envelopes: Iterable[Envelope]) -> None:
-        for envelope in envelopes:
-            self.pipeline.insert(envelope)
+        taken = list(envelopes)
+        self.pipeline.insert(*taken)
+        for envelope in taken:
             note_newest(self.newest, envelope)
         self.position = self.recorder.position
 

@@ -30,7 +30,7 @@ from facet.mapping.tile import Tile
 from facet_protocol.messages import PlaneFrame
 
 UnitNormal = tuple[int, int, int]
-AT_ONCE = 128  # (u, v) tiles that are rolled over before the next: as many as caches hold
+TILES_AT_ONCE = 128  # (u, v) tiles that are rolled over before the next: as many as caches hold
 FRAME_UNIT = 32  # a frame's normal is rounded to 1/32 a component: it moves rarely
 Place = int  # of a (u, v) tile
 Member = tuple[int, int]  # tile key, stamp of a tile-plane there
@@ -260,8 +260,8 @@ class ContourField:
         self.rolled = len(near)
         wanted = np.array(list(near.values()), np.bool_).reshape(-1, CELLS, CELLS)
         drawn, new = list(near), list[NDArray[np.int32]]()
-        for start in range(0, len(drawn), AT_ONCE):
-            part = slice(start, start + AT_ONCE)
+        for start in range(0, len(drawn), TILES_AT_ONCE):
+            part = slice(start, start + TILES_AT_ONCE)
             new += boundary_edges(self._windows(drawn[part]), wanted[part])
         old = [self.contours[plane_id].edges.get(place, _NO_EDGES) for plane_id, place in near]
         old_starts, new_starts = (starts_of([len(own) for own in each]) for each in (old, new))

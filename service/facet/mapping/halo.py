@@ -119,19 +119,19 @@ def fill_rows(masks, near, blocks_out, margin, along_y, rows):  # type: ignore[n
 
 @kernel(allocates=False, inlined=True)
 def _list_along_x(blocks, halo, near, width, y, z, margin, row, count):  # type: ignore[no-untyped-def]
-    """List the voxels of a row along x, its bits: their rows, for now, as words. near: place in
-    halo.near of the block at x, y of the middle one and z of the row. Returns how many there are
-    now."""
+    """List the voxels of a row along x, its bits: as words, for now, where their rows are found, 8
+    lines + x. near: place in halo.near of the block at x, y of the middle one and z of the row.
+    Returns how many there are now."""
     near += width * (y >> 3)
-    inside, cell, voxels = 8 * (z & 7) + (y & 7), np.int64(-99), blocks.rows[0]
+    inside, cell, start = 8 * (z & 7) + (y & 7), np.int64(-99), np.int64(0)
     while row != np.uint64(0):
         bit = np.int64(trailing_zeros(row))
         row &= row - np.uint64(1)
         x = bit - margin
         if x >> 3 != cell:  # into the next block
             cell = x >> 3
-            voxels = blocks.rows[blocks.lines[halo.near[near + cell], inside]]
-        halo.words[count] = voxels[x & 7] - 1
+            start = 8 * np.int64(blocks.lines[halo.near[near + cell], inside])
+        halo.words[count] = start + (x & 7)
         halo.places[count] = bit | ((y + margin) << 8) | ((z + margin) << 16)
         count += 1
     return count
@@ -146,7 +146,7 @@ def _list_along_y(blocks, halo, near, width, x, z, margin, row, count):  # type:
         row &= row - np.uint64(1)
         y = bit - margin
         line = blocks.lines[halo.near[near + width * (y >> 3)], 8 * (z & 7) + (y & 7)]
-        halo.words[count] = blocks.rows[line, x & 7] - 1
+        halo.words[count] = 8 * np.int64(line) + (x & 7)
         halo.places[count] = (x + margin) | (bit << 8) | ((z + margin) << 16)
         count += 1
     return count
@@ -178,6 +178,8 @@ def gather(blocks, observable, block, margin, halo):  # type: ignore[no-untyped-
         else:
             count = _list_along_x(blocks, halo, near, width, u, z, margin, row, count)
     for i in range(count):  # one look-up at a time for all: they do not wait for one another
+        words[i] = blocks.rows[words[i] >> 3, words[i] & 7] - 1
+    for i in range(count):
         seen = observable[words[i]]
         words[i] = seen
         poses[i] = seen >> 32
