@@ -30,7 +30,7 @@ from facet.sources.recording import Recording
 from facet.status import balance_of
 from facet_protocol import attachment, topics
 from facet_protocol.codec import decode
-from facet_protocol.messages import Conflict, Loss, Status
+from facet_protocol.messages import Conflict, Envelope, Loss, Status
 from fault_rig import SETTINGS, scans_in, small_scan
 from rig import START_NS, WAIT_S, free_endpoint, scan_envelope, wait_for_ear, wait_until
 from test_commands import Running
@@ -218,9 +218,9 @@ def slow_mapper(monkeypatch: pytest.MonkeyPatch, seconds: float) -> threading.Ev
     """Every scan takes so long, until the event is set."""
     quick, insert = threading.Event(), Pipeline.insert
 
-    def slowly(self: Pipeline, envelope: Any) -> bool:
-        quick.wait(seconds)
-        return insert(self, envelope)
+    def slowly(self: Pipeline, *envelopes: Envelope) -> bool:
+        quick.wait(seconds * len(envelopes))
+        return insert(self, *envelopes)
 
     monkeypatch.setattr(Pipeline, "insert", slowly)
     return quick

@@ -61,8 +61,9 @@ class Grouped(NamedTuple):
 class Mapper:
     """The planar map of one place: a pure function of the scans inserted and not retracted.
 
-    One owner, one thread. `insert` and `retract` take scans, `update` derives what they changed;
-    plane ids and events alone depend on when `update` is called (design 2)."""
+    One owner, one thread; while it puts in many points, another follows their beams. `insert` and
+    `retract` take scans, `update` derives what they changed; plane ids and events alone depend on
+    when `update` is called (design 2)."""
 
     def __init__(
         self,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator, Sequence
+from functools import lru_cache
 from pathlib import Path
 
 from facet.sources.dialects import Dialects
@@ -128,6 +129,7 @@ def _files(path: Path) -> list[Path]:
     return files
 
 
+@lru_cache(maxsize=1024)  # asked with each message, of few channels
 def _number(text: str | None) -> int:
     """A number of 32 bits; 0 for anything else that a channel of another's may say."""
     number = int(text) if text is not None and _U32.fullmatch(text) else 0
