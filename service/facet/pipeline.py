@@ -119,10 +119,12 @@ class Pipeline:
                 num_changes += len(one.scans)
                 continue
             if isinstance(one, Admitted):
-                self._admitted.append(one)
                 num_changes += 1
-                if one.replaced is not None:
+                if one.replaced is None:
+                    self._admitted.append(one)
+                else:
                     self._put_in()
+                    self._replace(one, one.replaced)
             for record in one.records:
                 self._say(record)
         return num_changes
@@ -163,19 +165,21 @@ class Pipeline:
         return dict(changes)
 
     def _put_in(self) -> None:
-        """What was admitted, into the map: the scans that take the place of no other at once."""
+        """All that was admitted, and takes the place of no other scan, into the map."""
         admitted, self._admitted = self._admitted, []
-        new = [one for one in admitted if one.replaced is None]
-        inserted = self._mapper.insert_all([one.scan for one in new]) if new else []
-        for one, counted in zip(new, inserted, strict=True):
+        if not admitted:
+            return
+        inserted = self._mapper.insert_all([one.scan for one in admitted])
+        for one, counted in zip(admitted, inserted, strict=True):
             self._account.settle(one.scan.source, "applied", also=_points(one.scan, counted))
             self._note(one)
-        for one in admitted:
-            if one.replaced is not None:
-                points = self._exchange(one.replaced, one.scan)
-                self._account.settle(one.scan.source, "conflict", also=points)
-                self._replaced += [r for r in one.records if isinstance(r, Conflict)]
-                self._note(one)
+
+    def _replace(self, one: Admitted, replaced: Scan) -> None:
+        """A scan into the place of another."""
+        points = self._exchange(replaced, one.scan)
+        self._account.settle(one.scan.source, "conflict", also=points)
+        self._replaced += [record for record in one.records if isinstance(record, Conflict)]
+        self._note(one)
 
     def _note(self, admitted: Admitted) -> None:
         """It is in the map."""

@@ -42,13 +42,6 @@ class Numbers:
             self.ends.insert(i + 1, number)
         return True
 
-    def follows(self, number: int) -> bool:
-        """Add a number if it comes right after the last. Whether it does."""
-        if not self.ends or number != self.ends[-1] + 1:
-            return False
-        self.ends[-1] = number
-        return True
-
     @property
     def first(self) -> int:
         return self.starts[0] if self.starts else 0
@@ -88,9 +81,6 @@ class SequenceLedger:
         if sequence == 0:
             return Noted(True)
         epochs = self._seen[source]
-        numbers = epochs.get(epoch) if self._current.get(source) == epoch else None
-        if numbers is not None and numbers.follows(sequence):  # mostly
-            return Noted(True, 0, sequence)
         is_restart = bool(epochs) and epoch not in epochs
         is_interleaved = epoch in epochs and epoch != self._current[source]
         self._current[source] = epoch

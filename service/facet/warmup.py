@@ -48,8 +48,9 @@ def warm_up(settings: MapSettings) -> None:
     mapper.counts()
     mapper.digest()
     del mapper
-    gc.collect()
-    gc.freeze()  # what a compiler leaves behind stays: it is a tenth of a second to look through
+    if not gc.get_freeze_count():  # once a process: what a compiler leaves behind stays, and takes
+        gc.collect()  # a twentieth of a second to look through
+        gc.freeze()
 
 
 def _grid(length: float, width: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -35,9 +35,9 @@ def eigenvalues(a, b, c, d, e, f):  # type: ignore[no-untyped-def]
     h = min(1.0, abs(half))
     h2 = h * h
     h4 = h2 * h2
-    low = (_C[0] + _C[1] * h) + h2 * (_C[2] + _C[3] * h)
-    high = (_C[4] + _C[5] * h) + h2 * (_C[6] + _C[7] * h) + h4 * _C[8]
-    t = low + h4 * high
+    head = (_C[0] + _C[1] * h) + h2 * (_C[2] + _C[3] * h)
+    tail = (_C[4] + _C[5] * h) + h2 * (_C[6] + _C[7] * h) + h4 * _C[8]
+    t = head + h4 * tail
     t -= ((4.0 * t * t - 3.0) * t - h) / (12.0 * t * t - 3.0)
     spread = 1.7320508075688772 * np.sqrt(max(0.0, 1.0 - t * t))
     far, one, other = 2.0 * p * t, p * (t + spread), p * (t - spread)

@@ -49,7 +49,7 @@ class Tabulator:
     def tabulate(self, tiles: dict[int, Tile]) -> Table:
         """The table of tiles, by key. An array that a tile had at the last call, too, must hold the
         same now."""
-        keys = sorted(key for key, tile in tiles.items() if len(tile.nodes.votes))
+        keys = sorted(key for key, tile in tiles.items() if tile.num_planes)
         parts = [_part_of(tiles[key]) for key in keys]
         starts = starts_of([len(part[0]) for part in parts])
         pair_starts = starts_of([len(part[PAIRS]) for part in parts])

@@ -13,7 +13,7 @@ from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.membership import CLAIMED, LOOK, MIXED, MOVED, NEW, OTHER, PURE, TOUCHED
 from facet.mapping.merging import plane_of
-from facet.mapping.settings import BLOCK, STEPS, TILE, VOXELS
+from facet.mapping.settings import BLOCK, STEPS, TILE
 from facet.mapping.sums import SUMS, count_points, read_sums, shift_moments
 
 STRAY = 0.47  # voxels: a voxel whose centroid is so far off its tile-plane is not fitted to
@@ -219,17 +219,15 @@ def _key(local, held, m):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _catch_up(sources, before, r, corner, news, tally, t, sums, told):  # type: ignore[no-untyped-def]
+def _catch_up(sources, before, r, corner, news, tally, t, sums):  # type: ignore[no-untyped-def]
     """Add what came to the voxels of an old run. news: (place (V,) in what follows, plus 1, and
-    (Q, SUMS) what the sums were); told: room for a run."""
+    (Q, SUMS) what the sums were)."""
     place, earlier = news
-    columns, count = sources[1], 0
+    columns = sources[1]
     for m in range(before.start[r], before.start[r] + before.size[r]):
-        told[count] = m
-        count += (place[before.rows[m]] != 0) & (before.state[m] != CLAIMED)
-    for n in range(count):
-        m = told[n]
         q = np.int64(place[before.rows[m]]) - 1
+        if q < 0 or before.state[m] == CLAIMED:
+            continue
         read_sums(columns, before.rows[m], sums)
         sums -= earlier[q]
         tally.total[t] += sums[0]
@@ -255,7 +253,7 @@ def _begin(sources, flags, tile_key, before, span, held, own, into, news, anew, 
         if held.old[r] != NEW:
             known = held.old[r] if held.old[r] >= 0 else OTHER - held.old[r]
             stays[known - span[2]] = True
-    sums, told = np.empty(SUMS, np.int64), np.empty(2 * VOXELS, np.int64)
+    sums = np.empty(SUMS, np.int64)
     for r in range(span[2], span[3]):
         o = first + before.plane[r]
         if into[o] < 0:
@@ -266,7 +264,7 @@ def _begin(sources, flags, tile_key, before, span, held, own, into, news, anew, 
         corner = _corner(sources[0], before.block[r], tile_key)
         t = own[0] + into[o]
         if flags[before.block[r]] & TOUCHED:
-            _catch_up(sources, before, r, corner, news, tally, t, sums, told)
+            _catch_up(sources, before, r, corner, news, tally, t, sums)
         if not stays[r - span[2]]:
             _drop(sources, before, r, corner, tally, t, sums)
     return lost, was

@@ -169,7 +169,7 @@ def find_records(traces, share, rows, count, starts):  # type: ignore[no-untyped
     for v in range(count):
         starts[v] = np.int64(traces.slot[rows[v]]) - 1
     for v in range(count):
-        if starts[v] >= 0 and traces.entries[share, starts[v], OWNER] != rows[v] + 1:
+        if not _is_record(traces, share, rows[v], starts[v]):
             starts[v] = -1
 
 
