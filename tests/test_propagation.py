@@ -69,13 +69,12 @@ def voxels_of(mapper: Mapper) -> dict[str, NDArray[Any]]:
 
 
 def patches_of(mapper: Mapper) -> dict[str, object]:
-    """Of the blocks that hold voxels: their patches and tile-planes, whether they ask far."""
+    """Of the blocks that hold voxels: their patches and tile-planes."""
     own, told = mapper._patches.patches, dict[str, object]()
     names = ("votes", "centroid", "scatter", "unit", "box", "rung", "counted")
     for block in np.flatnonzero(mapper._store.blocks.occupied.any(axis=1)).tolist():
         part = slice(int(own.number[block]))
         told[f"block {mapper._store.blocks.keys[block]}"] = (
-            bool(own.far[block]),
             *(getattr(own, name)[block, part].tobytes() for name in names),
             mapper._tiles.plane_of_patch[block, part].tobytes(),
         )

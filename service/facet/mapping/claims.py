@@ -12,33 +12,47 @@ import numpy as np
 from numba import prange
 from numpy.typing import NDArray
 
-from facet.mapping.blocks import CENTRE, Blocks, find, list_rows, pack, unpack
+from facet.mapping.blocks import CENTRE, Blocks, list_rows, list_voxels
+from facet.mapping.candidates import (
+    HIGH,
+    LOW,
+    NX,
+    NY,
+    NZ,
+    OFFSET,
+    WEIGHT,
+    cosine,
+    distance,
+    far_candidates,
+    near_candidates,
+    place_of,
+)
 from facet.mapping.kernel import kernel
 from facet.mapping.runs import dealt
 from facet.mapping.settings import PER_BLOCK, VOXELS
+from facet.mapping.unsettled import MOST, list_news, was_label
 
 LEFTOVER_REACH = 8  # voxels between a leftover and the box of the patch it joins
 CLAIM_REACH = 2  # voxels between a corner voxel and the box of a patch that claims it too
 PARALLEL_COS = 0.98
-HALF = 32.0  # 1/8 voxels: half a block
-OFFSET_STEP = 0.25  # 1/8 voxels: to so much the offset of a patch from there is rounded
 CHUNK = 16  # blocks that a thread takes at a time
 FEW = 128  # blocks that are not worth waking other threads for
+BESIDE_COS = 0.91  # a patch so near to a voxel's own is neither at an angle to it (CORNER_COS) nor
+# parallel to one that is (PARALLEL_COS): 36.9 and 11.5 degrees
 CORNER_COS = 0.8  # planes that share a corner voxel differ by more than 37 degrees
 FLAT_COS = 0.95  # planes that all are so near to one differ by less from one another
-NX, NY, NZ, OFFSET, WEIGHT = range(5)  # a candidate's plane: unit normal, offset; of its size
-LOW, HIGH = 5, 8  # its box: least and largest x, y, z
 OFF = 11  # distance of the voxel in turn from the plane
 FACTS = 12
 NEAR, FAR = 27 * PER_BLOCK, 125 * PER_BLOCK  # patches of a block and those beside it; and of those
 # two away
+CODES = 27 * 16  # 16 x neighbour + index of a patch there
 CLAIMS = np.dtype(  # scratch of one thread: patches that may claim the voxels of a block, N near
     # ones, C with those two blocks away; and the V voxels
     [
-        ("codes", np.int16, (FAR,)),  # (C,) 16 * neighbour + index
+        ("codes", np.int16, (FAR,)),  # (C,)
         ("columns", np.float64, (FACTS, FAR)),  # (FACTS, C) eighths, from the corner of the
         # block that asks
-        ("own", np.int64, (PER_BLOCK,)),  # which of them is the block's own patch, -1: none
+        ("of_code", np.int16, (CODES,)),  # which of the near ones has a code, -1: none
         ("angled", np.int16, (NEAR, NEAR)),  # (N, N) for each the near ones at an angle to it
         ("num_angled", np.int64, (NEAR,)),  # (N,) how many these are, -1: not looked up yet
         ("parallel", np.int16, (NEAR, FAR)),  # (N, C) for each near one those parallel to it
@@ -52,109 +66,29 @@ CLAIMS = np.dtype(  # scratch of one thread: patches that may claim the voxels o
         ("member", np.int64, (VOXELS,)),
         ("label", np.int64, (VOXELS,)),
         ("second", np.int64, (VOXELS,)),
+        ("again", np.int8, (VOXELS,)),  # whether they are labelled again
+        ("news", np.float64, (OFFSET + 1, MOST)),  # planes that changed near the block, before and
+        # now
+        ("new_codes", np.int16, (MOST,)),  # of those of them that are near, as they are now
+        ("new", np.int64, (MOST,)),  # which candidates these are
+        ("is_new", np.int8, (NEAR,)),  # (N,) likewise
     ],
     align=True,
 )
 
 
 @kernel(allocates=False)
-def _list(blocks, observable, member, block, found):  # type: ignore[no-untyped-def]
-    """List the voxels of a block. How many."""
-    count = list_rows(blocks, block, found.row, found.place)
+def _list(blocks, observable, member, block, with_empty, found):  # type: ignore[no-untyped-def]
+    """List the voxels of a block, those that are empty now too if `with_empty`. How many."""
+    if with_empty:
+        count = list_rows(blocks, block, found.row, found.place)
+    else:
+        count = list_voxels(blocks, block, blocks.occupied[block], found.row, found.place)
     for v in range(count):
         found.seen[v] = observable[found.row[v]]
     for v in range(count):
         found.member[v] = member[found.row[v]]
     return count
-
-
-@kernel(allocates=False)
-def _add_candidates(patches, places, num_places, tolerance, count, found):  # type: ignore[no-untyped-def]
-    """Append the patches of blocks whose plane comes within `tolerance` of the block that asks.
-    places (N, 5): block, code of its first patch, and blocks away along x, y, z. Returns how many
-    there are now."""
-    codes, columns = found.codes, found.columns
-    for at in range(num_places):
-        other = places[at, 0]
-        sx, sy, sz = 64 * places[at, 2], 64 * places[at, 3], 64 * places[at, 4]
-        for p in range(patches.number[other]):
-            if count == codes.shape[0]:
-                return count
-            plane = patches.plane[other, p]
-            ux, uy, uz = float(plane[0]), float(plane[1]), float(plane[2])
-            one = 1.0 / np.sqrt(ux * ux + uy * uy + uz * uz)
-            ux, uy, uz = ux * one, uy * one, uz * one
-            offset = plane[3] * OFFSET_STEP + ux * (HALF + sx) + uy * (HALF + sy) + uz * (HALF + sz)
-            beyond = abs(HALF * (ux + uy + uz) - offset) - HALF * (abs(ux) + abs(uy) + abs(uz))
-            if beyond > tolerance:
-                continue
-            columns[NX, count], columns[NY, count], columns[NZ, count] = ux, uy, uz
-            columns[OFFSET, count] = offset
-            columns[WEIGHT, count] = 1.0 / (1 << plane[4])
-            columns[LOW, count] = 8 * patches.box[other, p, 0] + sx
-            columns[LOW + 1, count] = 8 * patches.box[other, p, 1] + sy
-            columns[LOW + 2, count] = 8 * patches.box[other, p, 2] + sz
-            columns[HIGH, count] = 8 * patches.box[other, p, 3] + 8 + sx
-            columns[HIGH + 1, count] = 8 * patches.box[other, p, 4] + 8 + sy
-            columns[HIGH + 2, count] = 8 * patches.box[other, p, 5] + 8 + sz
-            codes[count] = places[at, 1] + p
-            count += 1
-    return count
-
-
-@kernel(allocates=False)
-def _near_candidates(blocks, patches, block, tolerance, found):  # type: ignore[no-untyped-def]
-    """Patches of a block and its 26 neighbours."""
-    places, num = found.places, 0
-    for n in range(27):
-        other = block if n == CENTRE else np.int64(blocks.neighbours[block, n])
-        if other >= 0:
-            places[num, 0], places[num, 1] = other, 16 * n
-            places[num, 2], places[num, 3], places[num, 4] = n % 3 - 1, n // 3 % 3 - 1, n // 9 - 1
-            num += 1
-    count = _add_candidates(patches, places, num, tolerance, 0, found)
-    found.own[:] = -1
-    for q in range(count):
-        if found.codes[q] >> 4 == CENTRE:
-            found.own[found.codes[q] & 15] = q
-        found.num_angled[q] = found.num_parallel[q] = -1
-    return count
-
-
-@kernel(allocates=False)
-def _far_candidates(blocks, patches, block, tolerance, count, found):  # type: ignore[no-untyped-def]
-    """Append the patches of the blocks two away: the other jamb of a door."""
-    places, num = found.places, 0
-    i, j, k = unpack(blocks.keys[block])
-    for n in range(125):
-        di, dj, dk = n % 5 - 2, (n // 5) % 5 - 2, n // 25 - 2
-        if max(abs(di), abs(dj), abs(dk)) < 2:
-            continue
-        other = find(blocks.table_keys, blocks.table_values, pack(i + di, j + dj, k + dk))
-        if other >= 0:
-            places[num, 0], places[num, 1] = other, 0
-            places[num, 2], places[num, 3], places[num, 4] = di, dj, dk
-            num += 1
-    found.num_parallel[:count] = -1
-    return _add_candidates(patches, places, num, tolerance, count, found)
-
-
-@kernel(allocates=False)
-def _place(local, seen):  # type: ignore[no-untyped-def]
-    """A voxel's rounded centroid, eighths from the block corner."""
-    return (
-        float(8 * (local & 7) + (seen & 15)),
-        float(8 * ((local >> 3) & 7) + ((seen >> 4) & 15)),
-        float(8 * (local >> 6) + ((seen >> 8) & 15)),
-    )
-
-
-@kernel(allocates=False)
-def _off(columns, q, c):  # type: ignore[no-untyped-def]
-    """Distance of a place from the plane of a candidate."""
-    return abs(
-        columns[NX, q] * c[0] + columns[NY, q] * c[1] + columns[NZ, q] * c[2] - columns[OFFSET, q]
-    )
 
 
 @kernel(allocates=False)
@@ -177,37 +111,34 @@ def _gap(columns, q, c):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _dot(columns, q, o):  # type: ignore[no-untyped-def]
-    return (
-        columns[NX, q] * columns[NX, o]
-        + columns[NY, q] * columns[NY, o]
-        + columns[NZ, q] * columns[NZ, o]
-    )
-
-
-@kernel(allocates=False)
 def _cost(columns, q, gap, tolerance):  # type: ignore[no-untyped-def]
     off = columns[OFF, q] / tolerance
     return off**2 + (gap / (8.0 * LEFTOVER_REACH)) ** 2 + columns[WEIGHT, q]
 
 
 @kernel(allocates=False)
-def _join(columns, near, c, seen, tolerance):  # type: ignore[no-untyped-def]
-    """Near candidate that a leftover at c joins, -1: none. It must face the voxel's sensor, its
-    plane must be near, and so must its box."""
+def _joining(columns, q, c, seen, tolerance):  # type: ignore[no-untyped-def]
+    """What it costs a leftover at c to join a near candidate; inf: it cannot. That must face the
+    voxel's sensor, its plane must be near, and so must its box."""
+    if columns[OFF, q] > tolerance:
+        return np.inf
+    gap = _gap(columns, q, c)
+    if gap > 8 * LEFTOVER_REACH:
+        return np.inf
     v0, v1, v2 = ((seen >> 16) & 31) - 8, ((seen >> 21) & 31) - 8, ((seen >> 26) & 31) - 8
+    faces = columns[NX, q] * v0 + columns[NY, q] * v1 + columns[NZ, q] * v2
     mixed = ((seen >> 31) & 1) == 1
+    if not mixed and faces <= 0.0:
+        return np.inf
+    return _cost(columns, q, gap, tolerance)
+
+
+@kernel(allocates=False)
+def _join(columns, near, c, seen, tolerance):  # type: ignore[no-untyped-def]
+    """Near candidate that a leftover at c joins, -1: none."""
     best, best_cost = -1, np.inf
     for q in range(near):
-        if columns[OFF, q] > tolerance:
-            continue
-        gap = _gap(columns, q, c)
-        if gap > 8 * LEFTOVER_REACH:
-            continue
-        faces = columns[NX, q] * v0 + columns[NY, q] * v1 + columns[NZ, q] * v2
-        if not mixed and faces <= 0.0:
-            continue
-        cost = _cost(columns, q, gap, tolerance)
+        cost = _joining(columns, q, c, seen, tolerance)
         if cost < best_cost:
             best, best_cost = q, cost
     return best
@@ -222,7 +153,7 @@ def _bridged(found, count, q, c, tolerance):  # type: ignore[no-untyped-def]
         number = 0
         for o in range(count):
             parallel[number] = o
-            number += _dot(columns, q, o) >= PARALLEL_COS
+            number += cosine(columns, q, columns, o) >= PARALLEL_COS
         found.num_parallel[q] = number
     x, y, z = _ways(columns, q, c)
     length = x * x + y * y + z * z
@@ -231,7 +162,7 @@ def _bridged(found, count, q, c, tolerance):  # type: ignore[no-untyped-def]
         ox, oy, oz = _ways(columns, o, c)
         dot = x * ox + y * oy + z * oz
         lengths = length * (ox * ox + oy * oy + oz * oz)
-        if dot < 0.0 and dot * dot > 0.5 * lengths and _off(columns, o, c) <= tolerance:
+        if dot < 0.0 and dot * dot > 0.5 * lengths and distance(columns, o, c) <= tolerance:
             return True
     return False
 
@@ -247,7 +178,7 @@ def _claim(found, near, count, c, tolerance, own):  # type: ignore[no-untyped-de
         number = 0
         for q in range(near):
             angled[number] = q
-            number += _dot(columns, q, own) <= CORNER_COS
+            number += cosine(columns, q, columns, own) <= CORNER_COS
         found.num_angled[own] = number
     best, best_cost, num_waiting = -1, np.inf, 0
     for a in range(found.num_angled[own]):
@@ -277,30 +208,89 @@ def _claim(found, near, count, c, tolerance, own):  # type: ignore[no-untyped-de
 def _flat(columns, count):  # type: ignore[no-untyped-def]
     """Whether all candidates look the same way: then there is no corner."""
     for q in range(1, count):  # noqa: SIM110 numba has no all() of a generator
-        if _dot(columns, q, 0) < FLAT_COS:
+        if cosine(columns, q, columns, 0) < FLAT_COS:
             return False
     return True
 
 
+@kernel(allocates=False)
+def _joins_another(found, num_new, own, c, seen, tolerance):  # type: ignore[no-untyped-def]
+    """Whether a leftover at c, of the candidate `own` (-1: of none), may join a new one instead."""
+    columns, last = found.columns, np.inf
+    if own >= 0:
+        columns[OFF, own] = distance(columns, own, c)
+        last = _joining(columns, own, c, seen, tolerance)
+    for n in range(num_new):
+        q = found.new[n]
+        columns[OFF, q] = distance(columns, q, c)
+        cost = _joining(columns, q, c, seen, tolerance)
+        if cost <= last and cost < np.inf:
+            return True
+    return False
+
+
+@kernel(allocates=False)
+def _is_claimed_anew(found, num_news, own, c, tolerance):  # type: ignore[no-untyped-def]
+    """Whether another patch may claim the voxel at c, of the candidate `own`, than before: one that
+    changed, or with the help of one."""
+    for n in range(num_news):
+        angled = cosine(found.columns, own, found.news, n) <= BESIDE_COS
+        if angled and distance(found.news, n, c) <= tolerance:
+            return True
+    return False
+
+
+@kernel(allocates=False)
+def _find_unsettled(patches, number, num_news, num_codes, tolerance, found):  # type: ignore[no-untyped-def]
+    """Mark in found.again those of a block's voxels, `number`, whose label may be another now that
+    patches changed (`list_news`). How many."""
+    num_new, asked = 0, 0
+    found.is_new[:] = 0
+    for n in range(num_codes):
+        q = np.int64(found.of_code[found.new_codes[n]])
+        if q >= 0:
+            found.new[num_new], found.is_new[q] = q, 1
+            num_new += 1
+    for v in range(number):
+        label, seen = np.int64(patches.label[found.row[v]]), found.seen[v]
+        again = label < -1
+        if not again and num_news > 0:
+            c, own = place_of(found.place[v], seen), np.int64(-1)
+            if label >= 0:
+                own = np.int64(found.of_code[label])
+                again = own < 0 or found.is_new[own] != 0
+            if not again and found.member[v] < 0:
+                again = _joins_another(found, num_new, own, c, seen, tolerance)
+            if not again and own >= 0:
+                again = _is_claimed_anew(found, num_news, own, c, tolerance)
+        found.again[v] = again
+        asked += again
+    return asked
+
+
 @kernel(parallel=True)
-def _label_all(blocks, observable, patches, which, tolerance, scratches, changed):  # type: ignore[no-untyped-def]
+def _label_all(  # type: ignore[no-untyped-def]
+    blocks, observable, patches, which, regrouped, changes, tolerance, scratches, changed
+):
     step = scratches.shape[0] * CHUNK
     for turn in prange(scratches.shape[0]):
         share = dealt(turn, scratches.shape[0])
         for start in range(share * CHUNK, which.shape[0], step):
             stop = min(which.shape[0], start + CHUNK)
             _label_some(
-                blocks, observable, patches, which, start, stop, tolerance, scratches[share],
-                changed,
+                blocks, observable, patches, which, regrouped, start, stop, changes, tolerance,
+                scratches[share], changed,
             )  # fmt: skip
 
 
 @kernel(allocates=False)
 def _label_some(  # type: ignore[no-untyped-def]
-    blocks, observable, patches, which, start, stop, tolerance, found, changed
+    blocks, observable, patches, which, regrouped, start, stop, changes, tolerance, found, changed
 ):
     for q in range(start, stop):
-        changed[q] = _label_block(blocks, observable, patches, which[q], tolerance, found)
+        changed[q] = _label_block(
+            blocks, observable, patches, which[q], regrouped[q], changes, tolerance, found
+        )
 
 
 def label_blocks(
@@ -308,39 +298,57 @@ def label_blocks(
     observable: NDArray[np.int64],
     patches: Any,
     which: NDArray[np.int32],
+    regrouped: NDArray[np.bool_],
+    changes: Any,
     tolerance: float,
     scratches: NDArray[np.void],
     changed: NDArray[np.bool_],
 ) -> None:
-    """Label every voxel of the blocks `which` (Q,) again; mark in `changed` (Q,) those where a
-    label changed. scratches: CLAIMS, one a share of the work.
+    """Label the unsettled voxels of the blocks `which` (Q,) again, which only the `regrouped` (Q,)
+    have, and those that a change of patches near by matters to; mark in `changed` (Q,) the blocks
+    where a label changed. changes: see `list_news`; scratches: CLAIMS, one a share of the work.
 
     Reads the patches of the next blocks, and notes in patches.far where it had to ask those two
-    away; every block writes its own voxels: threads change nothing."""
-    sources = blocks, observable, patches, which
+    away, until a whole block is asked at once; every block writes its own voxels: threads change
+    nothing."""
+    sources = blocks, observable, patches, which, regrouped
     if len(which) < FEW:
-        _label_some(*sources, 0, len(which), tolerance, scratches[0], changed)
+        _label_some(*sources, 0, len(which), changes, tolerance, scratches[0], changed)
     else:
-        _label_all(*sources, tolerance, scratches, changed)
+        _label_all(*sources, changes, tolerance, scratches, changed)
 
 
 @kernel(allocates=False)
-def _label_block(blocks, observable, patches, block, tolerance, found):  # type: ignore[no-untyped-def]
-    """Label the voxels of one block. Whether a label changed."""
-    near = count = _near_candidates(blocks, patches, block, tolerance, found)
+def _label_block(  # type: ignore[no-untyped-def]
+    blocks, observable, patches, block, regrouped, changes, tolerance, found
+):
+    """Label the voxels of one block that may have another label now. Whether one has."""
+    num_news, num_codes = list_news(blocks, patches, block, changes, tolerance, found)
+    if num_news == 0 and not regrouped:
+        return False
+    number = asked = _list(blocks, observable, patches.member, block, regrouped, found)
+    near = count = near_candidates(blocks, patches, block, tolerance, found)
+    if num_news < 0:
+        found.again[:number] = 1
+    else:
+        asked = _find_unsettled(patches, number, num_news, num_codes, tolerance, found)
+    if asked == 0:
+        return False
     columns, far = found.columns, False
     flat = _flat(columns, near)
-    number = _list(blocks, observable, patches.member, block, found)
     for v in range(number):
+        if not found.again[v]:
+            continue
         seen, member = found.seen[v], found.member[v]
         label, second, own = -1, -1, -1
         if seen != 0:
-            c = _place(found.place[v], seen)
+            c = place_of(found.place[v], seen)
             if member < 0 or not flat:
                 for q in range(near):
-                    columns[OFF, q] = _off(columns, q, c)
+                    columns[OFF, q] = distance(columns, q, c)
             if member >= 0:
-                label, own = 16 * CENTRE + member, found.own[member]
+                label = np.int64(16 * CENTRE + member)
+                own = np.int64(found.of_code[label])
             else:
                 own = _join(columns, near, c, seen, tolerance)
                 if own >= 0:
@@ -349,15 +357,16 @@ def _label_block(blocks, observable, patches, block, tolerance, found):  # type:
                 other, alone = _claim(found, near, count, c, tolerance, own)
                 if alone and not far:
                     far = True
-                    count = _far_candidates(blocks, patches, block, tolerance, near, found)
+                    count = far_candidates(blocks, patches, block, tolerance, near, found)
                     other, alone = _claim(found, near, count, c, tolerance, own)
                 if other >= 0:
                     second = np.int64(found.codes[other])
         found.label[v], found.second[v] = label, second
-    patches.far[block] = far
+    patches.far[block] = far or (asked < number and patches.far[block])
     changed = False
     for v in range(number):
-        row, label, second = found.row[v], found.label[v], found.second[v]
-        changed |= patches.label[row] != label or patches.second[row] != second
-        patches.label[row], patches.second[row] = label, second
+        if found.again[v]:
+            row, label, second = found.row[v], found.label[v], found.second[v]
+            changed |= was_label(patches.label[row]) != label or patches.second[row] != second
+            patches.label[row], patches.second[row] = label, second
     return changed

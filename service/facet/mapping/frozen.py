@@ -88,7 +88,8 @@ def _derive(mapper: Mapper, arrays: Arrays, history: dict[str, Any]) -> None:
         {int(k): Sighting(int(a), int(b), set(robots)) for k, a, b, robots in history["seen"]}
     )
     blocks = np.arange(mapper._store.num_blocks, dtype=np.int32)
-    grouped = mapper.group(blocks, blocks, mapper._store.touched)
+    rows = np.arange(mapper._store.num_rows, dtype=np.int32)
+    grouped = mapper.group(blocks, rows, mapper._store.touched)
     ids = _plane_ids(mapper, len(grouped.points.total), arrays)
     mapper._identity.restore(history["identity"], ids)
     mapper.outline(ids, grouped)

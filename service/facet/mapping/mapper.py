@@ -130,8 +130,7 @@ class Mapper:
         done("settle")
         num_stale, turned = self._normals.update(store, dirty)
         done("normals")
-        moved = store.blocks_of(dirty.rows)
-        grouped = self.group(np.union1d(turned, moved), moved, touched, done)
+        grouped = self.group(turned, dirty.rows, touched, done)
         lineage = self._identity.assign(len(grouped.points.total), self._heritage())
         updated = self.outline(lineage.ids, grouped, done)
         self.work = {
@@ -161,15 +160,16 @@ class Mapper:
     def group(
         self,
         turned: NDArray[np.int32],
-        moved: NDArray[np.int32],
+        dirty: NDArray[np.int32],
         touched: Touched,
         done: Timer = lambda stage: None,
     ) -> Grouped:
-        """Planes from normals: group again what blocks with changed normals (`turned`), changed
-        centroids (`moved`) and voxels with changed moments (`touched`) make stale."""
-        seen = self._store.blocks_of(touched.rows)
+        """Planes from normals: group again what blocks with changed normals (`turned`), voxels with
+        changed observables (rows `dirty`) and with changed moments (`touched`) make stale."""
+        seen, moved = self._store.blocks_of(touched.rows), self._store.blocks_of(dirty)
+        turned = np.union1d(turned, moved)
         regrouped, relabelled = self._patches.update(
-            self._store, self._normals.normals, turned, seen
+            self._store, self._normals.normals, turned, dirty, seen
         )
         done("patches")
         limit = limits(self.settings, self._patches.sigma() / TICKS)

@@ -14,15 +14,16 @@ from numba import prange
 from numpy.typing import NDArray
 
 from facet.mapping.blocks import list_rows, list_voxels, row_at
-from facet.mapping.claims import CLAIMS, HALF, OFFSET_STEP, label_blocks
+from facet.mapping.candidates import HALF, OFFSET_STEP
+from facet.mapping.claims import CLAIMS, label_blocks
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory
 from facet.mapping.normals import VALID, Normals
 from facet.mapping.rungs import FIRST_RUNG, LIMITS, RUNG_STEP, RUNGS, read_rungs
 from facet.mapping.runs import SHARES, dealt
 from facet.mapping.settings import PER_BLOCK, STEPS, VOXELS, MapSettings
-from facet.mapping.staleness import find_dependents
 from facet.mapping.store import VoxelStore
+from facet.mapping.unsettled import WAS, find_dependents, unsettle
 
 NORMAL_STEPS = 128.0  # the normal of a patch, as labels see it, is rounded to so many of one
 FEW = 512  # blocks that are not worth waking other threads for
@@ -40,7 +41,7 @@ class Patches(NamedTuple):
     plane: NDArray[np.int16]  # (.., 5) as the labels of voxels see it, see _round_plane
     rung: NDArray[np.int8]  # of sigma_N
     counted: NDArray[np.int16]  # votes that stand in the histogram of rungs
-    far: NDArray[np.bool_]  # (B,) the block's labels depend on patches two blocks away, not one
+    far: NDArray[np.bool_]  # (B,) the block's labels may depend on patches two blocks away, not one
     member: NDArray[np.int8]  # (V,) index of the patch that a valid voxel belongs to, -1: none
     label: NDArray[np.int16]  # (V,) 16 * neighbour + index: the patch that a voxel goes with
     second: NDArray[np.int16]  # (V,) another patch, at an angle, that claims a corner voxel
@@ -184,14 +185,21 @@ def _round_plane(votes, centroid, unit, plane):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _store(blocks, patches, block, count, own):  # type: ignore[no-untyped-def]
-    """Write a block's grouping. Whether it differs from what was there, and whether for the labels
-    of other blocks."""
+def _store(blocks, patches, block, count, own, was):  # type: ignore[no-untyped-def]
+    """Write a block's grouping, and to `was` what labels saw of the last. Whether it differs from
+    that."""
     votes, centroid, scatter, unit, box = own.votes, own.centroid, own.scatter, own.unit, own.box
     label, rows, places = own.label, own.rows, own.places
-    changed = shows = patches.number[block] != count
+    was.number = patches.number[block]
+    changed, others = was.number != count, np.int64(0)
     patches.number[block] = count
-    for p in range(count):
+    for p in range(max(count, was.number)):
+        for a in range(5):
+            was.plane[p, a] = patches.plane[block, p, a]
+        other = (p < count) != (p < was.number)
+        if p >= count:
+            others |= np.int64(other) << p
+            continue
         changed |= patches.votes[block, p] != votes[p]
         patches.votes[block, p] = votes[p]
         for a in range(3):
@@ -201,28 +209,33 @@ def _store(blocks, patches, block, count, own):  # type: ignore[no-untyped-def]
             patches.unit[block, p, a] = unit[p, a]
         for a in range(6):
             changed |= patches.scatter[block, p, a] != scatter[p, a]
-            shows |= patches.box[block, p, a] != box[p, a]
+            other |= patches.box[block, p, a] != box[p, a]
             patches.scatter[block, p, a] = scatter[p, a]
             patches.box[block, p, a] = box[p, a]
-        shows |= _round_plane(votes[p], centroid[p], unit[p], patches.plane[block, p])
+        other |= _round_plane(votes[p], centroid[p], unit[p], patches.plane[block, p])
+        others |= np.int64(other) << p
+    was.other = others
     for v in range(list_rows(blocks, block, rows, places)):
-        changed |= patches.member[rows[v]] != label[places[v]]
-        patches.member[rows[v]] = label[places[v]]
-    return changed | shows, shows
+        row, member = rows[v], label[places[v]]
+        if patches.member[row] != member:
+            changed = True
+            patches.member[row] = member
+            unsettle(patches.label, rows[v : v + 1])
+    return changed or others != 0
 
 
 @kernel
 def _group_some(  # type: ignore[no-untyped-def]
-    blocks, observable, normals, patches, which, start, stop, grouping, own, changed, shows
+    blocks, observable, normals, patches, which, start, stop, grouping, own, changed, was
 ):
     for q in range(start, stop):
         count = _group(blocks, observable, normals, which[q], grouping, own)
-        changed[q], shows[q] = _store(blocks, patches, which[q], count, own)
+        changed[q] = _store(blocks, patches, which[q], count, own, was[q])
 
 
 @kernel(parallel=True)
 def _group_all(  # type: ignore[no-untyped-def]
-    blocks, observable, normals, patches, which, grouping, scratches, changed, shows
+    blocks, observable, normals, patches, which, grouping, scratches, changed, was
 ):
     size = (which.shape[0] + SHARES - 1) // SHARES  # blocks beside one another share cache lines
     for turn in prange(SHARES):
@@ -230,7 +243,7 @@ def _group_all(  # type: ignore[no-untyped-def]
         start, stop = share * size, min(which.shape[0], (share + 1) * size)
         _group_some(
             blocks, observable, normals, patches, which, start, stop, grouping, scratches[share],
-            changed, shows,
+            changed, was,
         )  # fmt: skip
 
 
@@ -248,6 +261,7 @@ class PatchField:
         self.patches = empty_patches()
         self.histogram = np.zeros(RUNGS, np.int64)  # voxels by the rung of their patch
         self._flags = np.zeros(0, np.bool_)
+        self._first = np.zeros(0, np.int32)  # changes near a block, see find_dependents
         self._groups, self._claims = np.empty(SHARES, GROUP), np.empty(SHARES, CLAIMS)
 
     def update(
@@ -255,35 +269,48 @@ class PatchField:
         store: VoxelStore,
         normals: Normals,
         dirty: NDArray[np.int32],
+        moved: NDArray[np.int32],
         seen: NDArray[np.int32],
     ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Group the blocks `dirty` again (normals or observables changed) and sum the points of
-        the blocks `seen`.
+        """Group the blocks `dirty` again (normals or observables changed), label again what that
+        makes stale and the rows `moved` (observables changed), and sum the points of the blocks
+        `seen`.
 
         Returns blocks: (patches changed), (labels changed)."""
         self._fit(store)
-        changed, shows = np.empty(len(dirty), np.bool_), np.empty(len(dirty), np.bool_)
+        changed, was = np.empty(len(dirty), np.bool_), np.empty(len(dirty), WAS)
         sources = store.blocks, store.columns.observable, normals, self.patches
         if len(dirty) < FEW:
             scratch = self._groups[0]
-            _group_some(*sources, dirty, 0, len(dirty), self._grouping, scratch, changed, shows)
+            _group_some(*sources, dirty, 0, len(dirty), self._grouping, scratch, changed, was)
         else:
-            _group_all(*sources, dirty, self._grouping, self._groups, changed, shows)
-        near = np.union1d(self._around(store, dirty[shows]), dirty)
-        relabelled = np.zeros(len(near), np.bool_)
-        label_blocks(
-            store.blocks, store.columns.observable, self.patches, near, self._grouping.leftover,
-            self._claims, relabelled,
-        )  # fmt: skip
-        relabelled_blocks = near[relabelled]
-        other = np.union1d(seen, np.union1d(dirty, relabelled_blocks))
+            _group_all(*sources, dirty, self._grouping, self._groups, changed, was)
+        unsettle(self.patches.label, moved)
+        relabelled = self._label(store, dirty, was)
+        other = np.union1d(seen, np.union1d(dirty, relabelled))
         read_rungs(store.blocks, store.columns, normals.border, self.patches, other, self.histogram)
-        return dirty[changed], relabelled_blocks
+        return dirty[changed], relabelled
 
-    def _around(self, store: VoxelStore, blocks: NDArray[np.int32]) -> NDArray[np.int32]:
-        """Blocks whose labels depend on the patches of `blocks`."""
-        out = np.empty(store.num_blocks, np.int32)
-        return out[: find_dependents(store.blocks, self.patches.far, blocks, self._flags, out)]
+    def _label(
+        self, store: VoxelStore, dirty: NDArray[np.int32], was: NDArray[np.void]
+    ) -> NDArray[np.int32]:
+        """Label again what changed in the blocks `dirty`, `was` (Q,) being what they were before.
+        Returns the blocks where a label changed."""
+        near = np.empty(store.num_blocks, np.int32)
+        links = np.empty((2, 125 * int(np.count_nonzero(was["other"]))), np.int32)
+        changes = dirty, was, self._first, links
+        count = find_dependents(
+            store.blocks, self.patches.far, dirty, was, self._flags, self._first, links, near
+        )
+        near, relabelled = np.sort(near[:count]), np.empty(count, np.bool_)
+        regrouped = np.zeros(store.num_blocks, np.bool_)
+        regrouped[dirty] = True
+        label_blocks(
+            store.blocks, store.columns.observable, self.patches, near, regrouped[near], changes,
+            self._grouping.leftover, self._claims, relabelled,
+        )  # fmt: skip
+        self._first[near] = 0
+        return near[relabelled]
 
     def sigma(self) -> float:
         """Noise of the scene, ticks: the median over member voxels of their patch's rung."""
@@ -297,6 +324,7 @@ class PatchField:
         blocks, rows = len(store.blocks.keys), len(store.columns.block)
         if len(self._flags) < blocks:
             self._flags = np.zeros(blocks, np.bool_)
+            self._first = np.zeros(blocks, np.int32)
         columns = {}
         for name, column in self.patches._asdict().items():
             by_voxel = name in ("member", "label", "second")

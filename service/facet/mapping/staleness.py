@@ -1,5 +1,4 @@
-"""What is stale: voxels whose region, as far as it was looked at, holds a dirty voxel; and blocks
-whose labels depend on patches that changed."""
+"""What is stale: voxels whose region, as far as it was looked at, holds a dirty voxel."""
 
 from __future__ import annotations
 
@@ -128,19 +127,3 @@ def _column(lines, edge, y, z, r):  # type: ignore[no-untyped-def]
         for line in range(k * edge + y - r, k * edge + y + r + 1):
             seen |= lines[line]
     return seen
-
-
-@kernel(allocates=False)
-def find_dependents(blocks, far, which, flags, out):  # type: ignore[no-untyped-def]
-    """Blocks whose labels depend on the patches of the blocks `which`: these, those beside them,
-    and those two away that are `far` (B,), with or without a block between. flags (B,) stay false.
-    Lists each once; returns how many."""
-    count = 0
-    for q in range(which.shape[0]):
-        i, j, k = unpack(blocks.keys[which[q]])
-        for n in range(125):
-            di, dj, dk = n % 5 - 2, (n // 5) % 5 - 2, n // 25 - 2
-            other = find(blocks.table_keys, blocks.table_values, pack(i + di, j + dj, k + dk))
-            if other >= 0 and (max(abs(di), abs(dj), abs(dk)) < 2 or far[other]):
-                count = _list_once(other, flags, out, count)
-    return _clear(flags, out, count)
