@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from facet.admission import Admission
 from facet.placement import Admitted
@@ -15,10 +16,18 @@ from rig import room, room_scan, scan_envelope, unnumbered
 
 
 def admit(*envelopes: Envelope) -> tuple[list[int], dict[str, int]]:
-    """(stamps of what was admitted, what was counted)."""
+    """(numbers of what was admitted, what was counted): the same whether foreseen or not."""
+    told = [_admit(envelopes, foreseen) for foreseen in (0, 1, len(envelopes))]
+    assert told[0] == told[1] == told[2]
+    return told[0]
+
+
+def _admit(envelopes: tuple[Envelope, ...], foreseen: int) -> tuple[list[int], dict[str, int]]:
     account = Account()
     admission = Admission(account, "map", 8.0)
+    admission.foresee(envelopes[:foreseen])
     outcomes = [one for envelope in envelopes for one in admission.admit(envelope)]
+    assert not admission._foreseen
     counted = {n: v for n, v in account.counters().items() if "[" not in n}
     return [one.scan.sequence for one in outcomes if isinstance(one, Admitted)], counted
 
@@ -26,6 +35,22 @@ def admit(*envelopes: Envelope) -> tuple[list[int], dict[str, int]]:
 def test_every_scan_once() -> None:
     a, b, c = room(3)
     assert admit(a, b, a, c, b) == ([1, 2, 3], {"duplicate": 2})
+
+
+def test_what_is_foreseen_is_not_read_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    envelopes = room(3)
+    admission = Admission(Account(), "map", 8.0)
+    admission.foresee(envelopes)
+    monkeypatch.setattr(admission, "_read", None)
+    outcomes = [one for envelope in envelopes for one in admission.admit(envelope)]
+    assert [one.scan.sequence for one in outcomes if isinstance(one, Admitted)] == [1, 2, 3]
+
+
+def test_no_more_is_foreseen_than_there_is_room_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("facet.admission.MOST_FORESEEN", 2)
+    admission = Admission(Account(), "map", 8.0)
+    admission.foresee(room(3))
+    assert len(admission._foreseen) == 2
 
 
 def test_the_same_sequence_of_another_epoch_or_robot_is_another_scan() -> None:

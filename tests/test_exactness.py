@@ -47,6 +47,19 @@ def test_scans_put_in_together_are_as_each_alone(name: str) -> None:
 
 
 @every_log
+def test_beams_followed_beside_change_nothing(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("facet.mapping.mapper.MANY", 1)
+    whole = log(name).shuffled(9)
+    mapper = Mapper(whole.settings)
+    for scan in whole.scans:
+        mapper.insert(scan)
+        mapper.insert(whole.scans[0])
+        mapper.retract(whole.scans[0])
+    mapper.update()
+    assert mapper.digest() == truth_of(name)
+
+
+@every_log
 @pytest.mark.parametrize("seed", [11, 12])
 def test_what_was_taken_out_was_never_there(name: str, seed: int) -> None:
     undoes(log(name), seed=seed).check_invariants()

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -83,6 +84,31 @@ def test_bad_heads_are_refused_by_reason() -> None:
 def test_angles_that_no_scanner_has_are_refused(angle: float) -> None:
     message = LaserScan(pose=pose_message(POSE), start_angle=angle, ranges=[1.0])
     assert reason(message.SerializeToString()) == "bad_layout"
+
+
+def _doubles(values: list[float], *, packed: bool) -> bytes:
+    """Field 6 of a LaserScan as protobuf may write it."""
+    each = [struct.pack("<d", value) for value in values]
+    if packed:
+        return bytes([6 << 3 | 2, 8 * len(each)]) + b"".join(each)
+    return b"".join(bytes([6 << 3 | 1]) + one for one in each)
+
+
+def test_ranges_may_be_written_in_pieces() -> None:
+    bare = LaserScan(frame_id="map", pose=pose_message(POSE)).SerializeToString()
+    whole = bare + _doubles([1.0, 2.0, np.inf], packed=True)
+    pieces = _doubles([1.0], packed=True) + bare + _doubles([2.0, np.inf], packed=True)
+    apart = bare + _doubles([1.0, 2.0, np.inf], packed=False)
+    told = [decode_scan(Envelope("s", "foxglove.LaserScan", "protobuf", p), "r", "s")
+            for p in (whole, pieces, apart)]  # fmt: skip
+    for scan in told:
+        assert (len(scan.points), len(scan.no_return)) == (2, 1)
+        np.testing.assert_array_equal(scan.points, told[0].points)
+
+
+def test_bytes_that_are_no_doubles_are_refused() -> None:
+    bare = LaserScan(frame_id="map", pose=pose_message(POSE)).SerializeToString()
+    assert reason(bare + bytes([6 << 3 | 2, 7]) + bytes(7)) == "malformed"
 
 
 def test_a_scan_to_be_placed_later_needs_no_pose() -> None:

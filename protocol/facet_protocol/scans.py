@@ -14,11 +14,12 @@ from facet_protocol.poses import pose_message, pose_of
 from facet_protocol.projection import MAX_ANGLE, count_ignored, project_fan
 from facet_protocol.ros_definitions import ROS_SCANS
 from facet_protocol.ros_scans import decode_ros_scan
-from facet_protocol.wire import parse, split_bytes_field, stamp_of, timestamp_of
+from facet_protocol.wire import split_bytes_field, split_doubles_field, stamp_of, timestamp_of
 
 CLOUD_SCHEMA = "foxglove.PointCloud"
 FAN_SCHEMA = "foxglove.LaserScan"
 SCAN_SCHEMAS = (CLOUD_SCHEMA, FAN_SCHEMA, *ROS_SCANS)
+RANGES_FIELD = LaserScan.RANGES_FIELD_NUMBER
 REACH_M = 8.0  # how far a line beam that came back empty counts as free, unless the map says so
 
 _IDENTITY = Pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
@@ -104,7 +105,7 @@ def _decode_cloud(
 def _decode_fan(
     envelope: Envelope, robot: str, sensor: str, frame_id: str | None, pose_required: bool
 ) -> tuple[LineFan, _Head]:
-    message = parse(LaserScan, envelope.payload)
+    message, ranges = split_doubles_field(LaserScan, envelope.payload, RANGES_FIELD)
     head = _head(message, envelope, frame_id, pose_required)
     start, end = message.start_angle, message.end_angle
     if not (abs(start) <= MAX_ANGLE and abs(end) <= MAX_ANGLE):
@@ -119,7 +120,7 @@ def _decode_fan(
         pose=head.pose,
         start_angle=start,
         end_angle=end,
-        ranges=np.fromiter(message.ranges, np.float64, len(message.ranges)),
+        ranges=np.array(message.ranges[:], np.float64) if ranges is None else ranges,
     )
     return fan, head
 

@@ -95,6 +95,23 @@ def split_bytes_field(
     return parse(message_type, b"".join(rest)), field
 
 
+def split_doubles_field(
+    message_type: type[M], payload: bytes | memoryview, number: int
+) -> tuple[M, NDArray[np.float64] | None]:
+    """Likewise without the repeated field `number` of doubles, and a view of these (N,), packed as
+    they are; None where they lie apart, and are in the message."""
+    data = memoryview(payload).cast("B")
+    packed, found = (number << 3) | _BYTES, [f for f in _top_fields(data) if f[1] >> 3 == number]
+    if len(found) != 1 or found[0][1] != packed:
+        return parse(message_type, payload), None
+    start, _, begin, end = found[0]
+    field = data[_varint(data, begin)[1] : end]
+    if len(field) % 8:
+        raise ProtocolError(f"field {number}: {len(field)} bytes are no doubles")
+    rest = b"".join((data[:start], data[end:])) or payload
+    return parse(message_type, rest), np.frombuffer(field, "<f8")
+
+
 def unwrap(payload: bytes | memoryview, number: int) -> memoryview:
     """A view of bytes field `number` of any protobuf message: what an envelope holds."""
     data = memoryview(payload).cast("B")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -18,11 +19,12 @@ from facet.past import Past, at_once
 from facet.placement import Admitted, Dismissed, Placement
 from facet.publishers import Publishers
 from facet.resolution import Resolution, Settled
-from facet.rivals import Rivals
+from facet.rivals import Rivals, digest_of
 from facet.sources.naming import (
     POSE_SCHEMAS,
     TRANSFORM_SCHEMAS,
     is_correction,
+    is_scan,
     is_static,
     names_of,
     pose_frame,
@@ -56,6 +58,7 @@ from facet_protocol.wire import unwrap
 
 WAIT_NS = 500_000_000  # of stamps: for a scan's pose, and between two poses
 WAIT_BYTES = 256 << 20  # of scans that wait
+MOST_FORESEEN = 4096  # scans that are decoded before it is their turn
 
 
 class Moved(NamedTuple):
@@ -65,6 +68,12 @@ class Moved(NamedTuple):
     envelope: Envelope
     scans: tuple[tuple[Scan, Scan | None], ...]
     corrected: Corrected
+
+
+class _Foreseen(NamedTuple):
+    envelope: Envelope  # as long as it is here, no other has its id
+    scan: Scan
+    digest: bytes
 
 
 Outcome = Admitted | Dismissed | Moved
@@ -97,10 +106,11 @@ class Admission:
         self._account = account
         self._publishers = Publishers() if strict else None
         self._frame_id, self._reach_m = frame_id, reach_m
+        self._foreseen: dict[int, _Foreseen] = {}  # by the id of the envelope
         self._resolution = Resolution(frame_id, wait_ns, wait_bytes, logged=logged)
         self._firsts = Firsts()
         self._trajectories = Trajectories()
-        rivals = Rivals(self.past)
+        self._rivals = rivals = Rivals(self.past)
         self.corrections = Corrections(
             frame_id,
             self._firsts,
@@ -148,9 +158,20 @@ class Admission:
         self.past.thaw(frozen, directory)
         thaw_resolution(self._resolution, frozen, lambda e: self._decode(_inner(e)))
 
+    def foresee(self, envelopes: Iterable[Envelope]) -> None:
+        """Decode and hash scans that `admit` is given later, on whichever thread."""
+        for envelope in envelopes:
+            if len(self._foreseen) >= MOST_FORESEEN:
+                return
+            if is_scan(envelope) and envelope.rule is None:
+                with suppress(ProtocolError):  # it will be said in its turn
+                    known = _Foreseen(envelope, self._read(envelope), digest_of(envelope))
+                    self._foreseen[id(envelope)] = known
+
     def admit(self, envelope: Envelope) -> Sequence[Outcome]:
         """The scans to insert: this one, or such as have waited for this pose; or to be moved.
         Often none."""
+        known = self._foreseen.pop(id(envelope), None)
         if envelope.key in (RESOLVED_TOPIC, CORRECTED_TOPIC):
             return self._confirm(envelope)
         if envelope.key == CONFLICT_TOPIC:
@@ -162,7 +183,7 @@ class Admission:
             inner = _inner(envelope)
             if envelope.schema in TRANSFORM_SCHEMAS or envelope.schema in POSE_SCHEMAS:
                 return self._admit_pose(envelope, inner, source)
-            return self._admit_scan(envelope, inner, source)
+            return self._admit_scan(envelope, inner, source, known)
         except ProtocolError as error:
             self._refuse(source, error)
             return []
@@ -195,8 +216,12 @@ class Admission:
         placed = self._take(self._resolution.go_live())
         return [*placed, *self._take_moved(self.corrections.go_live())]
 
-    def _admit_scan(self, envelope: Envelope, inner: Envelope, source: str) -> Sequence[Outcome]:
-        scan = self._decode(inner)
+    def _admit_scan(
+        self, envelope: Envelope, inner: Envelope, source: str, known: _Foreseen | None
+    ) -> Sequence[Outcome]:
+        scan = self._decode(inner, known.scan if known is not None else None)
+        if known is not None:
+            self._rivals.know(envelope, known.digest)
         self._check_publisher(envelope, source)
         if not self._placement.meets(envelope, source):
             return []
@@ -213,23 +238,27 @@ class Admission:
             text = f"epoch {envelope.epoch} speaks under the name of another that is still there"
             raise ProtocolError(text, "duplicate_publisher")
 
-    def _decode(self, envelope: Envelope) -> Scan:
-        """The scan, with what is to be known of its frame. Raises ProtocolError."""
+    def _decode(self, envelope: Envelope, read: Scan | None = None) -> Scan:
+        """The scan, `read` if it was already, with what is to be known of its frame. Raises
+        ProtocolError."""
         if envelope.key.startswith(f"{PREFIX}/"):
             _check_scan_key(envelope.key)  # a name of ours that is none is refused, not mended
-        robot, sensor = names_of(envelope)
-        scan = decode_scan(envelope, robot, sensor, self._reach_m, pose_required=False)
+        scan = read if read is not None else self._read(envelope)
         if envelope.rule is not None and envelope.rule.frame:
             scan = replace(scan, frame_id=envelope.rule.frame)
         if scan.frame_id == self._frame_id:
             if not scan.has_pose:
                 raise ProtocolError(f"{envelope.schema}: no pose", "bad_pose")
         elif not scan.frame_id or (
-            scan.is_placed and not self._resolution.knows(robot, scan.frame_id)
+            scan.is_placed and not self._resolution.knows(scan.robot, scan.frame_id)
         ):
             text = f"frame_id is {scan.frame_id[:80]!r}, expected {self._frame_id!r}"
             raise ProtocolError(f"{envelope.schema}: {text}", "wrong_frame")
         return scan
+
+    def _read(self, envelope: Envelope) -> Scan:
+        """Raises ProtocolError."""
+        return decode_scan(envelope, *names_of(envelope), self._reach_m, pose_required=False)
 
     def _admit_pose(self, envelope: Envelope, inner: Envelope, source: str) -> Sequence[Outcome]:
         if envelope.key.startswith(f"{PREFIX}/"):

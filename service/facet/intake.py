@@ -6,7 +6,7 @@ import logging
 import threading
 import time
 from collections import Counter, deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import partial
 
@@ -110,6 +110,7 @@ class Intake:
         past: Past | None = None,
     ) -> None:
         self.follower: Sink | None = None  # set before the start
+        self.foresee: Callable[[list[Envelope]], None] = lambda scans: None  # likewise
         self._past = past  # is told where in the log scans lie
         self._written_to: LogPosition | None = None
         self._inbox, self._recorder, self._durable = inbox, recorder, durable
@@ -319,6 +320,7 @@ class Intake:
         if scans:
             position = self._recorder.position
             self._note_past(scans, position)
+            self.foresee(scans)
             self._durable.put(scans, position)
         while self._awaited:
             self._awaited.pop().set()

@@ -26,7 +26,7 @@ from facet_protocol.messages import (
 )
 
 Tile = tuple[int, int, int]
-AT_ONCE = 16  # scans that go into the map together, of whichever robots
+AT_ONCE = 64  # scans that go into the map together, of whichever robots
 BEATS = 16  # in a period, to one of which the points of a tile are sent
 RECORD_TOPICS = {
     ResolvedPose: topics.RESOLVED_TOPIC,

@@ -130,6 +130,10 @@ class Rivals:
         self._chosen: dict[Number, bytes] = {}
         self._refused: dict[tuple[str, int], Numbers] = {}
 
+    def know(self, envelope: Envelope, digest: bytes) -> None:
+        """The hash of the scan that it asks about next (`digest_of`)."""
+        self._hashed, self._digest = envelope, digest
+
     def claim(self, envelope: Envelope, source: str) -> Claim | None:
         """What it claims; None for one whose number does not count."""
         if not envelope.sequence or is_loose(envelope):
@@ -137,7 +141,7 @@ class Rivals:
         if max(envelope.epoch, envelope.sequence) >= 1 << 64:  # a log from elsewhere may say so
             return None
         if envelope is not self._hashed:  # most are asked about twice in a row
-            self._hashed, self._digest = envelope, _digest(envelope)
+            self.know(envelope, digest_of(envelope))
         number = Number(source, envelope.epoch, envelope.sequence)
         return Claim(number, self._digest, len(envelope.payload))
 
@@ -214,10 +218,10 @@ class Rivals:
         """The scan with that payload. Raises OSError, and ProtocolError when the log lacks it."""
         near = self._window.get(number)
         candidates = [near] if near is not None else []
-        if not any(_digest(e) == digest for e in candidates):
+        if not any(digest_of(e) == digest for e in candidates):
             candidates = self._past.read([number]).get(number, [])
         for envelope in candidates:
-            if _digest(envelope) == digest:
+            if digest_of(envelope) == digest:
                 return envelope
         text = f"{number.source}: scan {number.sequence} is not found in the log"
         raise ProtocolError(text, "unreadable_log")
@@ -302,7 +306,8 @@ class Rivals:
             self._num_bytes -= len(self._window.popitem(last=False)[1].payload)
 
 
-def _digest(envelope: Envelope) -> bytes:
+def digest_of(envelope: Envelope) -> bytes:
+    """The hash that tells scans of one number apart."""
     return hashlib.sha256(envelope.payload).digest()
 
 

@@ -38,10 +38,12 @@ from facet.sinks.snapshots import Snapshots
 from facet.sources.live import Inbox, LiveSource
 from facet.sources.naming import source_of
 from facet.status import Account
+from facet_protocol.messages import Envelope
 
 logger = logging.getLogger(__name__)
 
 CATCH_UP_S = 0.02  # after a long update: for the scans that came in meanwhile to become durable
+INSERT_S = 0.5  # so long scans go in while more come, before an update
 DRAIN_S = 1.0  # at the end: for what has come in to become durable
 LAST_UPDATE_S = 2.5  # at the end: no update starts later than this after `stop`
 JOIN_S = 5.0
@@ -128,6 +130,7 @@ class Service:
         self._intake.follower = self._publisher
         every_ns = int(self._config.publish.points_s * 1e9) if self._config.publish.points else 0
         self._admission = self._admit()
+        self._intake.foresee = self._admission.foresee
         self._pipeline = Pipeline(
             self._mapper,
             self._admission,
@@ -224,18 +227,12 @@ class Service:
         if not self._running.wait(timeout_s):
             return
         started = time.monotonic()
-        taken, num = self._durable.take(timeout_s), 0
-        while num < len(taken) and time.monotonic() <= self._stop_at:
-            now = taken[num : num + AT_ONCE]
-            for envelope in now:
-                note_newest(self._newest, envelope)
-            self._pipeline.insert(*now)
-            num += len(now)
-        for envelope in taken[num:]:
-            self.account.settle(source_of(envelope), "not_applied")
+        taken = self._durable.take(timeout_s)
+        self._insert(taken)
+        while taken and time.monotonic() - started < INSERT_S:  # what has come meanwhile, too
+            taken = self._durable.take(0.0)
+            self._insert(taken)
         self._pipeline.go_on()
-        if num == len(taken) and self._durable.taken_to is not None:
-            self._position = self._durable.taken_to
         if self._pipeline.is_stale and time.monotonic() <= self._stop_at:
             self.account.stages({"insert": (time.monotonic() - started) * 1e3})
             update = self._pipeline.update()
@@ -250,6 +247,20 @@ class Service:
             self.account.gauge("voxels", self._mapper.num_voxels)
         if self._position is not None and self._pipeline.is_settled and self._keeper.is_due():
             self._keeper.start(self._hold(self._position))
+
+    def _insert(self, taken: list[Envelope]) -> None:
+        """What is durable, as long as there is time."""
+        num = 0
+        while num < len(taken) and time.monotonic() <= self._stop_at:
+            now = taken[num : num + AT_ONCE]
+            for envelope in now:
+                note_newest(self._newest, envelope)
+            self._pipeline.insert(*now)
+            num += len(now)
+        for envelope in taken[num:]:
+            self.account.settle(source_of(envelope), "not_applied")
+        if num == len(taken) and self._durable.taken_to is not None:
+            self._position = self._durable.taken_to
 
     def _hold(self, position: LogPosition) -> Checkpoint:
         """The map as it is now, on the thread that owns it."""

@@ -265,6 +265,6 @@ def _check_digest(mapper: Mapper) -> None:
     assert told == digest.derived, "snapshot and digest disagree"
     anew = type(mapper)(mapper.settings)
     _unsettled(mapper._store, anew._store)
-    anew._free = mapper._free
+    anew._space = mapper._free
     anew.update()
     assert anew.digest() == digest, "the map is not what its integers derive to"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
@@ -78,7 +78,8 @@ class Mapper:
         self.changed_tiles: list[TileIndex] = []
         self.memory = memory or Heap()
         self._store = VoxelStore(self.memory)
-        self._free = FreeSpace(self.memory)
+        self._space = FreeSpace(self.memory)
+        self._beams: Future[None] | None = None  # being followed
         self._normals = NormalField(self.settings, self.memory)
         self._patches = PatchField(self.settings, self.memory)
         self._tiles = TileField(self.memory)
@@ -102,12 +103,10 @@ class Mapper:
         """Add resolved scans, of whichever robots, all at once."""
         ticks = quantise(scans, self.settings)
         if len(ticks.points) >= MANY:
-            beams = _BESIDE.submit(self._free.insert, ticks)
-            self._store.insert(ticks)
-            beams.result()
+            self._beams = _BESIDE.submit(self._free.insert, ticks)
         else:
-            self._store.insert(ticks)
             self._free.insert(ticks)
+        self._store.insert(ticks)
         self._witness.note(ticks, scans)
         self._census.count(scans, ticks, 1)
         self._stamp_ns = max(self._stamp_ns, *(scan.stamp_ns for scan in scans))
@@ -263,6 +262,14 @@ class Mapper:
     def check_invariants(self) -> None:
         """Raise AssertionError unless the map is what a map must be (style 7.5). Slow."""
         check_invariants(self)
+
+    @property
+    def _free(self) -> FreeSpace:
+        """The free space, when all beams are followed."""
+        beams, self._beams = self._beams, None
+        if beams is not None:
+            beams.result()
+        return self._space
 
     def _heritage(self) -> Heritage:
         """Voxels that the planes of this update share with those of the last."""

@@ -15,7 +15,7 @@ from facet.mapping.kernel import kernel
 from facet.mapping.settings import PER_BLOCK
 
 UNSETTLED = 1024  # taken off a label that is not true any more
-MOST = 128  # planes that changed near a block; with more, all its voxels are asked again
+MOST = 40  # planes that changed near a block; with more, all its voxels are asked again
 WAS = np.dtype(  # what the patches of a block were, to labels, before they were grouped again
     [
         ("number", np.int64),
