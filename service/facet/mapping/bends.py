@@ -97,6 +97,19 @@ def _pool(sums, corner, nodes, label, origin, out):  # type: ignore[no-untyped-d
 
 
 @kernel(allocates=False)
+def _copy_sums(old, old_starts, place, starts, sums):  # type: ignore[no-untyped-def]
+    """The sums (T, SUMS) of tiles that lay at a place (L,) among the old ones; else UNKNOWN."""
+    for n in range(place.shape[0]):
+        for t in range(starts[n], starts[n + 1]):
+            if place[n] == UNKNOWN:
+                sums[t, 0] = UNKNOWN
+                continue
+            from_t = old_starts[place[n]] + t - starts[n]
+            for s in range(SUMS):
+                sums[t, s] = old[from_t, s]
+
+
+@kernel(allocates=False)
 def _add_heights(store, normals, patches, rows, plane_of, origin, axes, pure, sums):  # type: ignore[no-untyped-def]
     """Likewise add to sums (K, ARC) where members are across the strip, and how far off its plane.
     axes: (K, 6) unit vectors across it and along its normal; pure: (K,) of pure members alone."""
@@ -130,14 +143,6 @@ class Kept(NamedTuple):
     sums: NDArray[np.int64]  # (T, SUMS), UNKNOWN where nobody asked
 
 
-class Turn(NamedTuple):
-    """How much the members' normals turn over one direction in a strip."""
-
-    angle: float  # radians, positive where the strip bulges
-    width: float  # voxels
-    axes: NDArray[np.float64]  # (6,) that direction, and the strip's normal
-
-
 @kernel
 def _spans(votes, scatter):  # type: ignore[no-untyped-def]
     """(K, 2) width and length of planes, voxels."""
@@ -151,8 +156,9 @@ def _spans(votes, scatter):  # type: ignore[no-untyped-def]
 
 @kernel
 def _turns(sums):  # type: ignore[no-untyped-def]
-    """(K, 2, 8) by plane, over the width and over the length: angle, width and axes of a `Turn`,
-    all 0 where there is none."""
+    """(K, 2, 8) how much the members' normals turn over the width of a plane, and over its length:
+    the angle, radians, positive where it bulges, the width, voxels, that direction and the plane's
+    normal; all 0 where there is none."""
     out = np.zeros((sums.shape[0], 2, 8))
     mean, unit, xx, normal = np.empty(3), np.empty(3), np.empty(6), np.empty(3)
     for k in range(sums.shape[0]):
@@ -255,32 +261,31 @@ class Bends:
         origin = np.floor(nodes.mean * STEPS).astype(np.int64)
         sums = self._sums(table, label, strips, origin)
         limit = np.radians(self._settings.bend_deg)
-        arcs: dict[int, Turn] = {}
         turns = _turns(sums)
-        for plane in np.flatnonzero(strips & (sums[:, 0] >= self._settings.n_min)).tolist():
-            across, along = (Turn(float(t[0]), float(t[1]), t[2:]) for t in turns[plane])
-            narrow = across.width < ARC_WIDTH and sums[plane, 0] >= ARC_VOTES
-            low, high = (-np.radians(HOLLOWED_DEG), np.inf) if narrow else (-limit, limit)
-            flat[plane] = abs(along.angle) <= limit and low <= across.angle <= high
-            asked = across.angle < -np.radians(ASKED_DEG) or across.angle > limit
-            if flat[plane] and narrow and asked:
-                arcs[plane] = across
-        axes = np.zeros((len(origin), 6))
-        pure = np.isin(np.arange(len(origin)), list(arcs))
+        across, width, along = turns[:, 0, 0], turns[:, 0, 1], turns[:, 1, 0]
+        judged = strips & (sums[:, 0] >= self._settings.n_min)
+        narrow = (width < ARC_WIDTH) & (sums[:, 0] >= ARC_VOTES)
+        low, high = (
+            np.where(narrow, -np.radians(HOLLOWED_DEG), -limit),
+            np.where(narrow, np.inf, limit),
+        )
+        straight = (np.abs(along) <= limit) & (low <= across) & (across <= high)
+        flat &= straight | ~judged
+        asked = (across < -np.radians(ASKED_DEG)) | (across > limit)
+        pure = judged & straight & narrow & asked  # they may lie on an arc
         hollow = occupation < FULL * widths * lengths
         thin = strips & flat & ~pure & (widths >= GAP_WIDTH) & hollow
-        for plane in np.flatnonzero(pure | thin).tolist():
-            axes[plane] = arcs[plane].axes if pure[plane] else _axes(nodes.scatter[plane])
+        axes = turns[:, 0, 2:].copy()
+        for plane in np.flatnonzero(thin).tolist():
+            axes[plane] = _axes(nodes.scatter[plane])
         heights = np.zeros((len(origin), ARC), np.int64)
-        asked = _nodes_of(label, pure | thin)
-        rows, sizes = self._members(table, asked)
-        _add_heights(
-            *self._voxels, rows, np.repeat(label[asked], sizes), origin, axes, pure, heights
-        )
-        for plane, across in arcs.items():
-            angle, deviation = _arc(heights[plane], across.width)
+        own = _nodes_of(label, pure | thin)
+        rows, sizes = self._members(table, own)
+        _add_heights(*self._voxels, rows, np.repeat(label[own], sizes), origin, axes, pure, heights)
+        for plane in np.flatnonzero(pure).tolist():
+            angle, deviation = _arc(heights[plane], float(width[plane]))
             least = max(np.radians(ARC_DEG), ARC_SIGMAS * deviation)
-            flat[plane] = angle * np.sign(across.angle) <= least
+            flat[plane] = angle * np.sign(across[plane]) <= least
         numbers = np.full(len(flat) + 1, FREE)  # FREE finds the last one
         bent = np.flatnonzero(strips & ~flat)
         numbers[bent] = np.arange(len(bent))
@@ -313,12 +318,11 @@ class Bends:
     def _carry_over(self, table: Table) -> Kept:
         """What is kept, in the order of a new table."""
         old, keys = self._kept, table.tile_keys
-        kept = Kept(keys, table.starts, np.full((len(table.total), SUMS), UNKNOWN, np.int64))
+        kept = Kept(keys, table.starts, np.empty((len(table.total), SUMS), np.int64))
         stirred = np.isin(keys, np.fromiter(self._stirred, np.int64, len(self._stirred)))
         same = np.isin(keys, old.tile_keys) & ~stirred
-        shift = old.starts[np.searchsorted(old.tile_keys, keys[same])] - table.starts[:-1][same]
-        to = np.flatnonzero(same[table.tile_of])
-        kept.sums[to] = old.sums[to + np.repeat(shift, np.diff(table.starts)[same])]
+        place = np.where(same, np.searchsorted(old.tile_keys, keys), UNKNOWN)
+        _copy_sums(old.sums, old.starts, place, table.starts, kept.sums)
         self._kept = kept
         self._stirred.clear()
         return kept

@@ -237,6 +237,18 @@ def _normals(scatter, unit):  # type: ignore[no-untyped-def]
     return out
 
 
+@kernel
+def _edges_of(edges, held):  # type: ignore[no-untyped-def]
+    """(N, 2) those of edges (E, 2) that begin at nodes that are held (T,), or end there: turned."""
+    out, count = np.empty((2 * edges.shape[0], 2), np.int64), 0
+    for e in range(edges.shape[0]):
+        for way in range(2):
+            if held[edges[e, way]]:
+                out[count, 0], out[count, 1] = edges[e, way], edges[e, 1 - way]
+                count += 1
+    return out[:count]
+
+
 class Touching(NamedTuple):
     """Pairs of a strip and a plane that touch, Q of them, in canonical order."""
 
@@ -250,11 +262,10 @@ def _touching(
 ) -> Touching:
     """Which planes touch strips, along edges (E, 2) that begin at these."""
     beside = (bent[edges[:, 1]] == FREE) & (label[edges[:, 1]] != FREE)
-    own = np.stack([bent[edges[beside, 0]], edges[beside, 1]], axis=1)
-    strip, node = np.unique(own, axis=0).T
-    both = np.stack([strip, label[node]], axis=1)
-    pairs, pair = np.unique(both, axis=0, return_inverse=True)
-    return Touching(pairs, pair.ravel(), node)
+    own = np.unique(bent[edges[beside, 0]] << 32 | edges[beside, 1])
+    strip, node = own >> 32, own & 0xFFFFFFFF
+    both, pair = np.unique(strip << 32 | label[node], return_inverse=True)
+    return Touching(np.stack([both >> 32, both & 0xFFFFFFFF], axis=1), pair, node)
 
 
 def find_ends(
@@ -270,8 +281,7 @@ def find_ends(
     num, mean, scatter = pool_points(table, bent, held, count)
     unit = np.zeros((count, 3))
     np.add.at(unit, bent[held], table.nodes.unit[held])
-    one, other = held[table.edges].T
-    edges = np.concatenate([table.edges[one], table.edges[other, ::-1]])
+    edges = _edges_of(table.edges, held)
     touching = _touching(planes.label, bent, edges)
     cuts = _cuts(
         num, mean, scatter, unit, bent[edges[held[edges[:, 1]]]], touching.pairs,

@@ -11,13 +11,16 @@ import math
 from typing import NamedTuple
 
 import numpy as np
+from numba import prange
 from numpy.typing import NDArray
 
 from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
+from facet.mapping.runs import SHARES
 from facet.mapping.settings import MapSettings
 
 NARROW = 5.0  # voxels: of a narrower node the fit tells no more than its members' normals
+MANY = 1 << 14  # edges that are worth waking other threads for
 TRUSTED = 30  # below this many voxels the mean normal is trusted more than the fit
 
 
@@ -128,22 +131,20 @@ def _best_cos(normals, narrow, unit, a, b):  # type: ignore[no-untyped-def]
     return cos
 
 
-@kernel
-def _facing(votes, scatter, unit):  # type: ignore[no-untyped-def]
-    """(T, 3) normals of nodes, and (T,) whether they are narrow."""
-    normals, narrow = np.empty((votes.shape[0], 3)), np.empty(votes.shape[0], np.bool_)
-    for t in range(votes.shape[0]):
+@kernel(allocates=False)
+def _face(votes, scatter, unit, start, stop, normals, narrow):  # type: ignore[no-untyped-def]
+    """Normals (T, 3) of the nodes from start to stop, and (T,) whether they are narrow."""
+    for t in range(start, stop):
         nx, ny, nz, _, across = plane_of(votes[t], scatter[t], unit[t])
         normals[t, 0], normals[t, 1], normals[t, 2] = nx, ny, nz
         narrow[t] = 12.0 * across < NARROW * NARROW
-    return normals, narrow
 
 
-@kernel
-def _edge_costs(votes, mean, unit, normals, narrow, edges, limit):  # type: ignore[no-untyped-def]
-    """(E,) cost of merging along each edge; inf where its two ends disagree by themselves."""
-    costs = np.empty(edges.shape[0])
-    for e in range(edges.shape[0]):
+@kernel(allocates=False)
+def _weigh(votes, mean, unit, normals, narrow, edges, start, stop, limit, costs):  # type: ignore[no-untyped-def]
+    """Costs (E,) of merging along the edges from start to stop; inf where the two ends of one
+    disagree by themselves."""
+    for e in range(start, stop):
         a, b = edges[e, 0], edges[e, 1]
         if votes[b] > votes[a]:
             a, b = b, a
@@ -154,7 +155,17 @@ def _edge_costs(votes, mean, unit, normals, narrow, edges, limit):  # type: igno
         w = abs(_offset(normals, mean, a, b))
         if w <= limit.offset:
             costs[e] = (1.0 - cos) / (1.0 - limit.edge_cos) + (w / limit.offset) ** 2
-    return costs
+
+
+@kernel(parallel=True)
+def _weigh_many(votes, mean, scatter, unit, edges, limit, normals, narrow, costs):  # type: ignore[no-untyped-def]
+    count, num = votes.shape[0], edges.shape[0]
+    for share in prange(SHARES):
+        start, stop = share * count // SHARES, (share + 1) * count // SHARES
+        _face(votes, scatter, unit, start, stop, normals, narrow)
+    for share in prange(SHARES):
+        start, stop = share * num // SHARES, (share + 1) * num // SHARES
+        _weigh(votes, mean, unit, normals, narrow, edges, start, stop, limit, costs)
 
 
 @kernel(allocates=False)
@@ -230,15 +241,23 @@ def _merge(votes, mean, scatter, unit, normals, narrow, edges, limit):  # type: 
 
 
 @kernel
-def merge_all(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-def]
-    """Merge nodes along edges (E, 2), which must come in a canonical order, best first. The four
-    statistics end as those of the merged nodes, at the root's row. Returns (T,) the root of each
-    node: its smallest member."""
-    normals, narrow = _facing(votes, scatter, unit)
-    costs = _edge_costs(votes, mean, unit, normals, narrow, edges, limit)
+def _merge_worth(votes, mean, scatter, unit, normals, narrow, edges, costs, limit):  # type: ignore[no-untyped-def]
+    """Merge nodes along those edges that are worth it, best first."""
     worth = np.flatnonzero(costs < np.inf)
     best_first = worth[np.argsort(costs[worth], kind="mergesort")]
     return _merge(votes, mean, scatter, unit, normals, narrow, edges[best_first], limit)
+
+
+@kernel
+def merge_all(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-untyped-def]
+    """Merge nodes along edges (E, 2), which must come in a canonical order. The four statistics end
+    as those of the merged nodes, at the root's row. Returns (T,) the root of each node: its
+    smallest member."""
+    count, num = votes.shape[0], edges.shape[0]
+    normals, narrow, costs = np.empty((count, 3)), np.empty(count, np.bool_), np.empty(num)
+    _face(votes, scatter, unit, 0, count, normals, narrow)
+    _weigh(votes, mean, unit, normals, narrow, edges, 0, num, limit, costs)
+    return _merge_worth(votes, mean, scatter, unit, normals, narrow, edges, costs, limit)
 
 
 def merge_nodes(
@@ -248,6 +267,10 @@ def merge_nodes(
 
     Returns (root of each node (T,), statistics with the merged ones at the roots' rows)."""
     merged = Nodes(*(column.copy() for column in nodes))
-    if not len(edges):
-        return np.arange(len(nodes.votes)), merged
-    return merge_all(*merged, edges, limit), merged
+    if len(edges) < MANY:
+        return merge_all(*merged, edges, limit), merged
+    count = len(nodes.votes)
+    judged = np.empty((count, 3)), np.empty(count, np.bool_)
+    costs = np.empty(len(edges))
+    _weigh_many(*merged, edges, limit, *judged, costs)
+    return _merge_worth(*merged, *judged, edges, costs, limit), merged

@@ -72,7 +72,7 @@ def group_planes(
     stages.detailed = int(keep.sum())
     label, nodes = _drop(label, nodes, keep)
 
-    every = np.stack(np.triu_indices(len(nodes.votes), 1), axis=1)
+    every = _every_pair(len(nodes.votes))
     tight = limit._replace(edge_cos=float(np.cos(limit.bridge)), offset=limit.cross)
     roots, merged = merge_nodes(nodes, every, tight)
     into, nodes = _relabel(roots, merged)
@@ -82,6 +82,17 @@ def group_planes(
     occupation = _occupation(label, table, len(nodes.votes))
     stages.final = len(nodes.votes)
     return PlaneSet(label, core, nodes, occupation, stages)
+
+
+@kernel
+def _every_pair(count):  # type: ignore[no-untyped-def]
+    """(E, 2) all edges between `count` nodes, ascending."""
+    out, num = np.empty((count * (count - 1) // 2, 2), np.int64), 0
+    for a in range(count):
+        for b in range(a + 1, count):
+            out[num, 0], out[num, 1] = a, b
+            num += 1
+    return out
 
 
 def detail_level(
@@ -105,7 +116,7 @@ def detail_level(
 def _relabel(roots: NDArray[np.int64], merged: Nodes) -> tuple[NDArray[np.int64], Nodes]:
     is_root = roots == np.arange(len(roots))
     label = (np.cumsum(is_root) - 1)[roots]
-    return label, Nodes(*(np.ascontiguousarray(c[is_root]) for c in merged))
+    return label, Nodes(*(np.take(c, np.flatnonzero(is_root), axis=0) for c in merged))
 
 
 def _drop(
@@ -113,7 +124,7 @@ def _drop(
 ) -> tuple[NDArray[np.int64], Nodes]:
     new = np.where(keep, np.cumsum(keep) - 1, FREE)
     label = np.where(label == FREE, FREE, new[label]) if len(new) else label
-    return label, Nodes(*(np.ascontiguousarray(c[keep]) for c in nodes))
+    return label, Nodes(*(np.take(c, np.flatnonzero(keep), axis=0) for c in nodes))
 
 
 def _occupation(label: NDArray[np.int64], table: Table, count: int) -> NDArray[np.int64]:

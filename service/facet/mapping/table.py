@@ -71,7 +71,8 @@ class Tabulator:
         runs: list[tuple[int, int, int]] = []
         for n, (key, part) in enumerate(zip(keys, parts, strict=True)):
             place, old = self._parts.get(key, (-1, part))
-            if any(part[c] is not old[c] for c in (0, POINTS, PAIRS)):
+            same = part[0] is old[0] and part[POINTS] is old[POINTS] and part[PAIRS] is old[PAIRS]
+            if not same:
                 place = -1
             first, _, before = runs[-1] if runs else (0, 0, -1)
             if place >= 0 and before >= 0 and place - before == n - first:
