@@ -15,6 +15,11 @@ from facet_protocol.messages import Envelope, Pose
 from rig import room, room_scan, scan_envelope, unnumbered
 
 
+@pytest.fixture(autouse=True)
+def _large_scans_too(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("facet.admission.FORESEEN_BYTES", 1 << 24)
+
+
 def admit(*envelopes: Envelope) -> tuple[list[int], dict[str, int]]:
     """(numbers of what was admitted, what was counted): the same whether foreseen or not."""
     told = [_admit(envelopes, foreseen) for foreseen in (0, 1, len(envelopes))]
@@ -51,6 +56,23 @@ def test_no_more_is_foreseen_than_there_is_room_for(monkeypatch: pytest.MonkeyPa
     admission = Admission(Account(), "map", 8.0)
     admission.foresee(room(3))
     assert len(admission._foreseen) == 2
+    monkeypatch.setattr("facet.admission.FORESEEN_BYTES", 10)
+    admission = Admission(Account(), "map", 8.0)
+    admission.foresee(room(3))
+    assert not admission._foreseen
+
+
+def test_what_cannot_be_foreseen_fails_in_its_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    admission = Admission(Account(), "map", 8.0)
+    (envelope,) = room(1)
+
+    def fail(envelope: Envelope) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(admission, "_read", fail)
+    admission.foresee([envelope])
+    with pytest.raises(MemoryError):
+        admission.admit(envelope)
 
 
 def test_the_same_sequence_of_another_epoch_or_robot_is_another_scan() -> None:

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
+from facet.mapping.claims import BESIDE_COS, CORNER_COS, PARALLEL_COS
 from facet.mapping.mapper import Mapper
-from facet.mapping.unsettled import MOST, UNSETTLED, WAS, unsettle, was_label
+from facet.mapping.unsettled import UNSETTLED, WAS, unsettle, was_label
 from mapping_logs import LOGS, Log, log
 
 
@@ -58,9 +61,13 @@ def test_so_they_are_in_a_map_that_hardly_changes() -> None:
     goes_through(whole, mapper)
 
 
+def test_what_changed_beside_the_own_patch_can_neither_claim_nor_help() -> None:
+    nearest = math.acos(CORNER_COS) - math.acos(PARALLEL_COS)
+    assert math.cos(nearest) <= BESIDE_COS
+
+
 def test_a_label_knows_what_it_was() -> None:
     labels = np.array([-1, 0, 431], np.int16)
     unsettle(labels, np.array([0, 2, 2]))
     assert labels.tolist() == [-1 - UNSETTLED, 0, 431 - UNSETTLED]
     assert [was_label(int(label)) for label in labels] == [-1, 0, 431]
-    assert MOST > 2

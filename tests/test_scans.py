@@ -106,6 +106,15 @@ def test_ranges_may_be_written_in_pieces() -> None:
         np.testing.assert_array_equal(scan.points, told[0].points)
 
 
+def test_what_the_walk_does_not_follow_protobuf_reads() -> None:
+    bare = LaserScan(frame_id="map", pose=pose_message(POSE)).SerializeToString()
+    many = bare + _doubles([1.0] * 600, packed=False)
+    group = bare + _doubles([1.0] * 600, packed=False) + bytes([15 << 3 | 3, 15 << 3 | 4])
+    for payload in (many, group):
+        scan = decode_scan(Envelope("s", "foxglove.LaserScan", "protobuf", payload), "r", "s")
+        assert len(scan.points) == 600
+
+
 def test_bytes_that_are_no_doubles_are_refused() -> None:
     bare = LaserScan(frame_id="map", pose=pose_message(POSE)).SerializeToString()
     assert reason(bare + bytes([6 << 3 | 2, 7]) + bytes(7)) == "malformed"

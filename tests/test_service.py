@@ -8,6 +8,7 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
@@ -16,12 +17,15 @@ import zenoh
 from facet.commands.play import RobotPublisher
 from facet.commands.replay import replay_log
 from facet.config import Config, load_config
+from facet.intake import DurableQueue
 from facet.mapping.mapper import Mapper
 from facet.mapping.settings import MapSettings
 from facet.service import Service
 from facet.sinks.durable_file import DurableFile
+from facet.sinks.recorder import LogPosition
 from facet.sources.naming import is_scan
 from facet.sources.recording import Recording
+from facet.status import Account
 from facet_protocol import topics
 from facet_protocol.codec import decode
 from rig import WAIT_S, room, service_and_client, wait_until
@@ -225,6 +229,16 @@ def test_a_full_queue_sheds_the_oldest_and_says_so(
     assert account["received"] == 10
     assert account["recorded"] == 4
     assert account["lost_upstream"] == 0
+
+
+def test_what_was_left_out_at_the_end_is_read_at_the_next_start() -> None:
+    durable, account = DurableQueue(1 << 20), Account()
+    durable.put(room(2), LogPosition("a.mcap", 100, ()))
+    stopped = SimpleNamespace(_stop_at=0.0, _position=None, _durable=durable, account=account)
+    Service._insert(stopped, durable.take(0.0))  # type: ignore[arg-type]
+    Service._insert(stopped, durable.take(0.0))  # type: ignore[arg-type]
+    assert stopped._position is None
+    assert account["not_applied"] == 2
 
 
 def test_a_fault_of_the_mapper_ends_the_service_and_not_the_log(

@@ -99,9 +99,13 @@ def split_doubles_field(
     message_type: type[M], payload: bytes | memoryview, number: int
 ) -> tuple[M, NDArray[np.float64] | None]:
     """Likewise without the repeated field `number` of doubles, and a view of these (N,), packed as
-    they are; None where they lie apart, and are in the message."""
-    data = memoryview(payload).cast("B")
-    packed, found = (number << 3) | _BYTES, [f for f in _top_fields(data) if f[1] >> 3 == number]
+    they are; None where they lie apart, or the walk ends before the payload: then all is in the
+    message."""
+    data, packed = memoryview(payload).cast("B"), (number << 3) | _BYTES
+    try:
+        found = [field for field in _top_fields(data) if field[1] >> 3 == number]
+    except ProtocolError:  # it may be right all the same
+        return parse(message_type, payload), None
     if len(found) != 1 or found[0][1] != packed:
         return parse(message_type, payload), None
     start, _, begin, end = found[0]

@@ -58,7 +58,8 @@ from facet_protocol.wire import unwrap
 
 WAIT_NS = 500_000_000  # of stamps: for a scan's pose, and between two poses
 WAIT_BYTES = 256 << 20  # of scans that wait
-MOST_FORESEEN = 4096  # scans that are decoded before it is their turn
+MOST_FORESEEN = 4096  # scans that are decoded before it is their turn,
+FORESEEN_BYTES = 16 << 10  # none of them larger: of large ones most is read where it lies
 
 
 class Moved(NamedTuple):
@@ -163,8 +164,9 @@ class Admission:
         for envelope in envelopes:
             if len(self._foreseen) >= MOST_FORESEEN:
                 return
-            if is_scan(envelope) and envelope.rule is None:
-                with suppress(ProtocolError):  # it will be said in its turn
+            is_small = len(envelope.payload) <= FORESEEN_BYTES
+            if is_small and envelope.rule is None and is_scan(envelope):
+                with suppress(Exception):  # whatever it is, `admit` comes upon it in its turn
                     known = _Foreseen(envelope, self._read(envelope), digest_of(envelope))
                     self._foreseen[id(envelope)] = known
 

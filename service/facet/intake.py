@@ -313,7 +313,7 @@ class Intake:
         for envelope, message in said:
             if self.follower is not None:
                 self.follower.write(envelope, message)
-        scans, self._scans = self._scans, []
+        scans = self._scans  # till they are handed on: `drain` waits for that
         for source, num in Counter(map(source_of, scans)).items():
             self._account.count("recorded", source, num)
             self._acknowledge(source)
@@ -322,6 +322,7 @@ class Intake:
             self._note_past(scans, position)
             self.foresee(scans)
             self._durable.put(scans, position)
+            self._scans = []
         while self._awaited:
             self._awaited.pop().set()
 

@@ -9,6 +9,7 @@ import logging
 import mmap
 import os
 import tempfile
+import threading
 import weakref
 from dataclasses import dataclass
 from pathlib import Path
@@ -50,7 +51,7 @@ class PagedMemory:
     def __init__(self, directory: Path, max_bytes: int) -> None:
         self._directory, self._max_bytes = directory, max_bytes
         self._regions: dict[int, Region] = {}  # by the address of the column
-        self._heap = Heap()
+        self._heap, self._lock = Heap(), threading.Lock()
         self.times_given_back = 0
 
     def grown(self, column: Column, used: int, capacity: int) -> Column:
@@ -59,20 +60,23 @@ class PagedMemory:
         num_bytes = int(np.prod(shape, dtype=np.int64)) * column.dtype.itemsize
         if num_bytes < SMALLEST:
             return self._heap.grown(column, used, capacity)
-        self._regions = {k: r for k, r in self._regions.items() if r.pages() is not None}
-        region = self._regions.pop(_address(column), None) if column.nbytes else None
-        if region is not None and used:
-            clear(column[used:])
-        try:
-            fd = os.dup(region.fd) if region is not None and used else self._file()
-            out, pages = _mapped(fd, shape, column.dtype, num_bytes)
-        except OSError as error:
-            logger.warning("a column of the map stays in memory, %s: %s", self._directory, error)
-            return self._heap.grown(column, used, capacity)
-        if region is None:
-            out[:used] = column[:used]
-        self._regions[_address(out)] = Region(fd, weakref.ref(pages))
-        return out
+        with self._lock:  # beams are followed on a thread of their own
+            self._regions = {k: r for k, r in self._regions.items() if r.pages() is not None}
+            region = self._regions.pop(_address(column), None) if column.nbytes else None
+            if region is not None and used:
+                clear(column[used:])
+            try:
+                fd = os.dup(region.fd) if region is not None and used else self._file()
+                out, pages = _mapped(fd, shape, column.dtype, num_bytes)
+            except OSError as error:
+                logger.warning(
+                    "a column of the map stays in memory, %s: %s", self._directory, error
+                )
+                return self._heap.grown(column, used, capacity)
+            if region is None:
+                out[:used] = column[:used]
+            self._regions[_address(out)] = Region(fd, weakref.ref(pages))
+            return out
 
     def rest(self) -> None:
         """Give all pages back when the process holds too much: what is hot comes back at once."""

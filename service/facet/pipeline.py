@@ -26,7 +26,8 @@ from facet_protocol.messages import (
 )
 
 Tile = tuple[int, int, int]
-AT_ONCE = 64  # scans that go into the map together, of whichever robots
+AT_ONCE = 64  # scans that go into the map together, of whichever robots,
+POINTS_AT_ONCE = 1 << 18  # or fewer with so many points
 BEATS = 16  # in a period, to one of which the points of a tile are sent
 RECORD_TOPICS = {
     ResolvedPose: topics.RESOLVED_TOPIC,
@@ -64,6 +65,7 @@ class Pipeline:
         self._sinks, self._outgoing = tuple(sinks), outgoing
         self._points_every_ns = points_every_ns  # 0: points are not sent
         self._admitted: list[Admitted] = []  # not in the map yet: within a call alone
+        self._num_points = 0  # theirs
         self._applied: dict[str, Applied] = {}
         self._replaced: list[Conflict] = []  # since the last update
         self._changed_tiles: set[Tile] = set()
@@ -86,7 +88,7 @@ class Pipeline:
         for envelope in envelopes:
             self.log_time_ns = max(self.log_time_ns, envelope.received_ns)
             num_changes += self._apply(self._admission.admit(envelope))
-            if len(self._admitted) >= AT_ONCE:
+            if len(self._admitted) >= AT_ONCE or self._num_points >= POINTS_AT_ONCE:
                 self._put_in()
         self._put_in()
         return num_changes > 0
@@ -122,6 +124,7 @@ class Pipeline:
                 num_changes += 1
                 if one.replaced is None:
                     self._admitted.append(one)
+                    self._num_points += len(one.scan.points)
                 else:
                     self._put_in()
                     self._replace(one, one.replaced)
@@ -166,7 +169,7 @@ class Pipeline:
 
     def _put_in(self) -> None:
         """All that was admitted, and takes the place of no other scan, into the map."""
-        admitted, self._admitted = self._admitted, []
+        admitted, self._admitted, self._num_points = self._admitted, [], 0
         if not admitted:
             return
         inserted = self._mapper.insert_all([one.scan for one in admitted])

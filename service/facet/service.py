@@ -259,7 +259,7 @@ class Service:
             num += len(now)
         for envelope in taken[num:]:
             self.account.settle(source_of(envelope), "not_applied")
-        if num == len(taken) and self._durable.taken_to is not None:
+        if taken and num == len(taken):
             self._position = self._durable.taken_to
 
     def _hold(self, position: LogPosition) -> Checkpoint:

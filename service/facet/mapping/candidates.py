@@ -12,7 +12,8 @@ from facet.mapping.kernel import kernel
 
 HALF = 32.0  # half a block
 OFFSET_STEP = 0.25  # to so much the offset of a patch from the middle of its block is rounded
-NX, NY, NZ, OFFSET, WEIGHT = range(5)  # a candidate's plane: unit normal, offset; of its size
+NX, NY, NZ, OFFSET, WEIGHT = range(5)  # a candidate's plane: unit normal, offset; and 1 over
+# a power of two of its votes
 LOW, HIGH = 5, 8  # its box: least and largest x, y, z
 
 

@@ -309,8 +309,8 @@ def label_blocks(
     where a label changed. changes: see `list_news`; scratches: CLAIMS, one a share of the work.
 
     Reads the patches of the next blocks, and notes in patches.far where it had to ask those two
-    away, until a whole block is asked at once; every block writes its own voxels: threads change
-    nothing."""
+    away (taken back only when a whole block is asked at once); every block writes its own voxels:
+    threads change nothing."""
     sources = blocks, observable, patches, which, regrouped
     if len(which) < FEW:
         _label_some(*sources, 0, len(which), changes, tolerance, scratches[0], changed)

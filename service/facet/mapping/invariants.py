@@ -133,6 +133,7 @@ def _check_labels(mapper: Mapper) -> None:
     store, patches = mapper._store, mapper._patches.patches
     count = store.num_rows
     block = store.columns.block[:count]
+    assert patches.label[:count].min(initial=-1) >= -1, "a label is still to be found"
     for name, labels in (("label", patches.label[:count]), ("claim", patches.second[:count])):
         on = np.flatnonzero(labels >= 0)
         near, index = labels[on] >> 4, labels[on] & 15

@@ -61,7 +61,8 @@ class Grouped(NamedTuple):
 class Mapper:
     """The planar map of one place: a pure function of the scans inserted and not retracted.
 
-    One owner, one thread; while it puts in many points, another follows their beams. `insert` and
+    One owner, one thread; another follows the beams of many points, until the free space is asked
+    for. `insert` and
     `retract` take scans, `update` derives what they changed; plane ids and events alone depend on
     when `update` is called (design 2)."""
 
@@ -266,9 +267,9 @@ class Mapper:
     @property
     def _free(self) -> FreeSpace:
         """The free space, when all beams are followed."""
-        beams, self._beams = self._beams, None
-        if beams is not None:
-            beams.result()
+        if self._beams is not None:
+            self._beams.result()
+            self._beams = None
         return self._space
 
     def _heritage(self) -> Heritage:

@@ -43,7 +43,8 @@ class Patches(NamedTuple):
     counted: NDArray[np.int16]  # votes that stand in the histogram of rungs
     far: NDArray[np.bool_]  # (B,) the block's labels may depend on patches two blocks away, not one
     member: NDArray[np.int8]  # (V,) index of the patch that a valid voxel belongs to, -1: none
-    label: NDArray[np.int16]  # (V,) 16 * neighbour + index: the patch that a voxel goes with
+    label: NDArray[np.int16]  # (V,) 16 * neighbour + index: the patch that a voxel goes with, -1:
+    # none; less by UNSETTLED between grouping and labelling
     second: NDArray[np.int16]  # (V,) another patch, at an angle, that claims a corner voxel
 
 
@@ -186,8 +187,8 @@ def _round_plane(votes, centroid, unit, plane):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=False)
 def _store(blocks, patches, block, count, own, was):  # type: ignore[no-untyped-def]
-    """Write a block's grouping, and to `was` what labels saw of the last. Whether it differs from
-    that."""
+    """Write a block's grouping, and to `was` what labels saw of the last. Whether anything of it
+    is another now."""
     votes, centroid, scatter, unit, box = own.votes, own.centroid, own.scatter, own.unit, own.box
     label, rows, places = own.label, own.rows, own.places
     was.number = patches.number[block]
@@ -268,43 +269,43 @@ class PatchField:
         self,
         store: VoxelStore,
         normals: Normals,
+        turned: NDArray[np.int32],
         dirty: NDArray[np.int32],
-        moved: NDArray[np.int32],
         seen: NDArray[np.int32],
     ) -> tuple[NDArray[np.int32], NDArray[np.int32]]:
-        """Group the blocks `dirty` again (normals or observables changed), label again what that
-        makes stale and the rows `moved` (observables changed), and sum the points of the blocks
+        """Group the blocks `turned` again (normals or observables changed), label again what that
+        makes stale and the rows `dirty` (observables changed), and sum the points of the blocks
         `seen`.
 
         Returns blocks: (patches changed), (labels changed)."""
         self._fit(store)
-        changed, was = np.empty(len(dirty), np.bool_), np.empty(len(dirty), WAS)
+        changed, was = np.empty(len(turned), np.bool_), np.empty(len(turned), WAS)
         sources = store.blocks, store.columns.observable, normals, self.patches
-        if len(dirty) < FEW:
+        if len(turned) < FEW:
             scratch = self._groups[0]
-            _group_some(*sources, dirty, 0, len(dirty), self._grouping, scratch, changed, was)
+            _group_some(*sources, turned, 0, len(turned), self._grouping, scratch, changed, was)
         else:
-            _group_all(*sources, dirty, self._grouping, self._groups, changed, was)
-        unsettle(self.patches.label, moved)
-        relabelled = self._label(store, dirty, was)
-        other = np.union1d(seen, np.union1d(dirty, relabelled))
+            _group_all(*sources, turned, self._grouping, self._groups, changed, was)
+        unsettle(self.patches.label, dirty)
+        relabelled = self._label(store, turned, was)
+        other = np.union1d(seen, np.union1d(turned, relabelled))
         read_rungs(store.blocks, store.columns, normals.border, self.patches, other, self.histogram)
-        return dirty[changed], relabelled
+        return turned[changed], relabelled
 
     def _label(
-        self, store: VoxelStore, dirty: NDArray[np.int32], was: NDArray[np.void]
+        self, store: VoxelStore, turned: NDArray[np.int32], was: NDArray[np.void]
     ) -> NDArray[np.int32]:
-        """Label again what changed in the blocks `dirty`, `was` (Q,) being what they were before.
+        """Label again what changed in the blocks `turned`, `was` (Q,) being what they were before.
         Returns the blocks where a label changed."""
         near = np.empty(store.num_blocks, np.int32)
         links = np.empty((2, 125 * int(np.count_nonzero(was["other"]))), np.int32)
-        changes = dirty, was, self._first, links
+        changes = turned, was, self._first, links
         count = find_dependents(
-            store.blocks, self.patches.far, dirty, was, self._flags, self._first, links, near
+            store.blocks, self.patches.far, turned, was, self._flags, self._first, links, near
         )
         near, relabelled = np.sort(near[:count]), np.empty(count, np.bool_)
         regrouped = np.zeros(store.num_blocks, np.bool_)
-        regrouped[dirty] = True
+        regrouped[turned] = True
         label_blocks(
             store.blocks, store.columns.observable, self.patches, near, regrouped[near], changes,
             self._grouping.leftover, self._claims, relabelled,

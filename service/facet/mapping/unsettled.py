@@ -44,7 +44,8 @@ def was_label(label):  # type: ignore[no-untyped-def]
 @kernel(allocates=False)
 def find_dependents(blocks, far, which, was, flags, first, links, out):  # type: ignore[no-untyped-def]
     """Blocks whose labels may depend on what changed in the blocks `which` (Q,): these, those
-    beside one that shows, and those two away that are `far` (B,), with or without a block between.
+    beside one where a patch is another, and those two away from it that are `far` (B,), with or
+    without a block between.
 
     flags (B,) stay false. Lists each block once, and in first (B,) and links (2, 125 Q) which of
     the Q it depends on: first is 1 + a place in links, 0: on none; there lie q and the next one's
@@ -78,8 +79,8 @@ def find_dependents(blocks, far, which, was, flags, first, links, out):  # type:
 @kernel(allocates=False)
 def list_news(blocks, patches, block, changes, tolerance, found):  # type: ignore[no-untyped-def]
     """List in found.news the planes, before and now, of patches near a block that changed, and in
-    found.new_codes those of them that are in it or beside it, as they are now. How many, and how
-    many: -1, there are too many.
+    found.new_codes those of them that are in it or beside it, as they are now. Returns the number
+    of planes, -1: too many, and that of codes.
 
     changes: regrouped blocks (Q,), what their patches were, first and links (`find_dependents`)."""
     which, was, first, links = changes
