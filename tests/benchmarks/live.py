@@ -14,7 +14,9 @@ import signal
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -103,17 +105,21 @@ def service(endpoint: str, log: Path) -> Iterator[subprocess.Popen[str]]:
     """`facet run` with recorder and publisher, ready; must end cleanly."""
     command = facet("run", "--listen", endpoint, "--record", log, "--viewer", "off")
     child = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    lines: deque[str] = deque(maxlen=100)
     try:
         assert child.stderr is not None
         deadline = time.monotonic() + START_S
         while "ready" not in child.stderr.readline():
             if child.poll() is not None or time.monotonic() > deadline:
                 raise RuntimeError("the service did not start")
+        said = threading.Thread(target=lines.extend, args=(child.stderr,), daemon=True)
+        said.start()  # a pipe that nobody reads is soon full
         yield child
     finally:
         child.send_signal(signal.SIGTERM)
-        _, rest = child.communicate(timeout=30)
+        child.wait(timeout=30)
     if child.returncode != 0:
+        rest = "".join(lines)
         out.print(f"the service ended with {child.returncode}:\n{rest}", markup=False)
 
 
