@@ -106,6 +106,8 @@ def _decode_fan(
     envelope: Envelope, robot: str, sensor: str, frame_id: str | None, pose_required: bool
 ) -> tuple[LineFan, _Head]:
     message, ranges = split_doubles_field(LaserScan, envelope.payload, RANGES_FIELD)
+    if ranges is None:
+        ranges = np.fromiter(message.ranges, np.float64, len(message.ranges))
     head = _head(message, envelope, frame_id, pose_required)
     start, end = message.start_angle, message.end_angle
     if not (abs(start) <= MAX_ANGLE and abs(end) <= MAX_ANGLE):
@@ -120,7 +122,7 @@ def _decode_fan(
         pose=head.pose,
         start_angle=start,
         end_angle=end,
-        ranges=np.array(message.ranges[:], np.float64) if ranges is None else ranges,
+        ranges=ranges,
     )
     return fan, head
 

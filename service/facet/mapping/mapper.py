@@ -62,9 +62,8 @@ class Mapper:
     """The planar map of one place: a pure function of the scans inserted and not retracted.
 
     One owner, one thread; another follows the beams of many points, until the free space is asked
-    for. `insert` and
-    `retract` take scans, `update` derives what they changed; plane ids and events alone depend on
-    when `update` is called (design 2)."""
+    for. `insert` and `retract` take scans, `update` derives what they changed; plane ids and events
+    alone depend on when `update` is called (design 2)."""
 
     def __init__(
         self,
