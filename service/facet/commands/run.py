@@ -27,8 +27,9 @@ from facet.commands.settings import (
     mapping_overrides,
     robots_overrides,
 )
-from facet.commands.terminal import Exit, InputError, out, set_up_logging, table
+from facet.commands.terminal import Exit, InputError, out, table
 from facet.config import Config, load_config
+from facet.logbook import Logbook, keep_log
 from facet.session import client_endpoint, open_session, service_settings
 
 if TYPE_CHECKING:
@@ -98,7 +99,6 @@ def run(
     all of it. At the end the log is finished, with a checkpoint and model.json beside it. The
     first start compiles for a minute or two. Exit code 3: scans were lost, the table says how many.
     """
-    set_up_logging()
     overrides = {
         "map.id": map_id,
         "network.listen": listen or None,
@@ -121,6 +121,7 @@ def serve(config: Config) -> Exit:
     from facet.service import ACKNOWLEDGED, Service
     from facet.sinks.recorder import single_writer
 
+    book = keep_log()
     if config.record.directory.is_file():
         raise InputError(f"{config.record.directory} is a file: the log needs a folder")
     mapper = make_mapper(config)
@@ -137,7 +138,7 @@ def serve(config: Config) -> Exit:
             logger.info("acknowledged is what is %s", ACKNOWLEDGED[config.record.mode])
             logger.info("ready: map %s on %s", config.map.id, ", ".join(config.network.listen))
             try:
-                _watch(service, config, stop)
+                _watch(service, config, stop, book)
             finally:
                 model = service.stop()
                 if model is not None:
@@ -174,11 +175,12 @@ def stop_signals() -> Iterator[threading.Event]:
             signal.signal(number, handler)
 
 
-def _watch(service: Service, config: Config, stop: threading.Event) -> None:
-    """Wait for the end; the viewer may come and go."""
+def _watch(service: Service, config: Config, stop: threading.Event, book: Logbook) -> None:
+    """Wait for the end; the viewer may come and go, the log's reader too."""
     viewer = _start_viewer(config)
     try:
         while not stop.wait(WATCH_S) and not service.ended.is_set():
+            service.account.set_counter("log_lines_dropped", book.num_dropped)
             if viewer is not None and viewer.poll() is not None:
                 logger.warning("the viewer ended with code %d; the map goes on", viewer.returncode)
                 service.account.count("viewer_ended")

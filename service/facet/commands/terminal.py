@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator
@@ -33,13 +32,6 @@ class Exit(IntEnum):
 
 class InputError(Exception):
     """Something given that cannot be read; the text says what."""
-
-
-def set_up_logging() -> None:
-    """One line a message on standard error."""
-    logging.basicConfig(
-        level=logging.INFO, format="%(asctime)s %(levelname)s %(name)s: %(message)s", force=True
-    )
 
 
 def table(title: str, columns: Iterable[str], rows: Iterable[Iterable[object]]) -> None:

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import zenoh
 
+from facet.logbook import keep_log
 from facet.session import client_settings, open_session
 from facet.sinks.screen import Screen
 from facet_protocol import topics
@@ -187,7 +188,7 @@ def main(arguments: list[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     if options.tied:
         _end_with_parent()
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(name)s: %(message)s")
+    keep_log()
     stop = threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda *_: stop.set())
