@@ -14,6 +14,7 @@ from facet.mapping.bits import population, trailing_zeros
 from facet.mapping.blocks import find, pack, unpack
 from facet.mapping.kernel import kernel
 from facet.mapping.lanes import LANES, load, store
+from facet.mapping.memory import sparse
 from facet.mapping.settings import BLOCK
 
 WIDEST = 20  # voxels that a halo may reach beyond its block on each side
@@ -43,7 +44,7 @@ HALO = np.dtype(  # scratch of one thread: the surroundings of one block at a ti
 
 def make_halos(count: int) -> NDArray[np.void]:
     """(count,) HALO: 2.2 MB each, of which only what is used gets memory."""
-    return np.empty(count, HALO)
+    return sparse(count, HALO)
 
 
 @kernel(allocates=False)

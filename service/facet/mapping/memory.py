@@ -6,11 +6,12 @@ row comes into use; then the room that a column has in reserve is free."""
 
 from __future__ import annotations
 
+import mmap
 from collections.abc import Iterator
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 Column = NDArray[Any]
 CHUNK = 1 << 20  # bytes that are looked at at a time
@@ -52,6 +53,17 @@ def copied(memory: Memory, column: Column, used: int) -> Column:
     for part in _written(column[:used]):
         out[part] = column[part]
     return out
+
+
+def sparse(count: int, dtype: DTypeLike) -> Column:
+    """Zeros (count,) of which little will be written, in small pages: what is zeroed for each touch
+    of large ones can cost more than what is done there."""
+    kind = np.dtype(dtype)
+    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
+    room = mmap.mmap(-1, count * kind.itemsize, flags)
+    if hasattr(mmap, "MADV_NOHUGEPAGE"):
+        room.madvise(mmap.MADV_NOHUGEPAGE)
+    return np.frombuffer(room, kind)
 
 
 def grow_all(memory: Memory, columns: C, used: int, capacity: int) -> C:

@@ -23,7 +23,7 @@ from facet.mapping.adaptive import (
 from facet.mapping.blocks import list_voxels
 from facet.mapping.halo import gather, make_halos
 from facet.mapping.kernel import kernel
-from facet.mapping.memory import Heap, Memory, grow_all
+from facet.mapping.memory import Heap, Memory, grow_all, sparse
 from facet.mapping.principal import analyse_all
 from facet.mapping.runs import dealt
 from facet.mapping.settings import MapSettings
@@ -193,7 +193,7 @@ class NormalField:
         self._dirty = np.zeros((0, 8), np.uint64)
         self._first = np.zeros(0, np.int32)  # dirty voxels by block, see mark_dirty
         self._flags = np.zeros(0, np.bool_)
-        self._halos, self._scratches = make_halos(SHARES), np.zeros(SHARES, SCRATCH)
+        self._halos, self._scratches = make_halos(SHARES), sparse(SHARES, SCRATCH)
         self._traces = make_traces(SHARES)
 
     def restore(self, store: VoxelStore, normals: Normals) -> None:

@@ -17,7 +17,7 @@ from facet.mapping.blocks import list_rows, list_voxels, row_at
 from facet.mapping.candidates import HALF, OFFSET_STEP
 from facet.mapping.claims import CLAIMS, label_blocks
 from facet.mapping.kernel import kernel
-from facet.mapping.memory import Heap, Memory
+from facet.mapping.memory import Heap, Memory, sparse
 from facet.mapping.normals import VALID, Normals
 from facet.mapping.rungs import FIRST_RUNG, LIMITS, RUNG_STEP, RUNGS, read_rungs
 from facet.mapping.runs import SHARES, dealt
@@ -263,7 +263,7 @@ class PatchField:
         self.histogram = np.zeros(RUNGS, np.int64)  # voxels by the rung of their patch
         self._flags = np.zeros(0, np.bool_)
         self._first = np.zeros(0, np.int32)  # changes near a block, see find_dependents
-        self._groups, self._claims = np.empty(SHARES, GROUP), np.empty(SHARES, CLAIMS)
+        self._groups, self._claims = sparse(SHARES, GROUP), sparse(SHARES, CLAIMS)
 
     def update(
         self,

@@ -18,6 +18,7 @@ from facet.mapping.bits import population
 from facet.mapping.halo import take
 from facet.mapping.kernel import kernel
 from facet.mapping.lanes import LANES
+from facet.mapping.memory import sparse
 from facet.mapping.principal import PLACES, PRINCIPAL, analyse
 from facet.mapping.region import FACED, MOST, SUMS, face, is_beside, within, within_slab
 from facet.mapping.settings import VOXELS
@@ -53,7 +54,7 @@ def make_traces(shares: int) -> Traces:
     """Room for shares x ENTRIES sums; what is not used takes no memory."""
     return Traces(
         np.zeros(0, np.int32),
-        np.zeros((shares, ENTRIES, ENTRY), np.int32),
+        sparse(shares * ENTRIES * ENTRY, np.int32).reshape(shares, ENTRIES, ENTRY),
         np.zeros(shares, np.int64),
     )
 
