@@ -10,7 +10,18 @@ import pytest
 from numba import njit
 from numpy.typing import NDArray
 
-from facet.mapping.lanes import LANES, add_products, larger, load, no_sums, splat, store, total
+from facet.mapping.lanes import (
+    LANES,
+    QUARTERS,
+    add_products,
+    larger,
+    load,
+    load_part,
+    no_sums,
+    splat,
+    store,
+    total,
+)
 
 Column = NDArray[np.int16]
 AT = 3  # columns need not begin at a full register
@@ -62,6 +73,28 @@ def test_each_lane_is_as_if_alone(source: str, plain: Callable[[Column, Column],
         with np.errstate(over="ignore"):
             assert out[span].tolist() == plain(one[span], other[span]).tolist()
         assert (np.delete(out, np.r_[span]) == 99).all()  # and nothing beside them is written
+
+
+@njit
+def unpacked(packed: NDArray[np.int64], out: NDArray[np.int16]) -> None:
+    for part in range(4):
+        store(out[part], AT, load_part(packed, AT, 16 * part))
+
+
+@njit
+def moved(packed: NDArray[np.int64], out: NDArray[np.int64]) -> None:
+    store(out, AT, load(packed, AT + 1))
+
+
+def test_wide_numbers_are_moved_whole_and_read_in_parts() -> None:
+    packed = np.random.default_rng(1).integers(-(2**63), 2**63 - 1, AT + LANES + 2)
+    parts = packed.view(np.int16).reshape(-1, 4).T  # the lowest first
+    out = np.full((4, AT + LANES + 2), 99, np.int16)
+    unpacked(packed, out)
+    assert (out[:, AT : AT + LANES] == parts[:, AT : AT + LANES]).all()
+    wide = np.full(AT + QUARTERS + 2, 99)
+    moved(packed, wide)
+    assert wide.tolist() == [99] * AT + packed[AT + 1 : AT + 1 + QUARTERS].tolist() + [99] * 2
 
 
 @njit

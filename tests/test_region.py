@@ -15,7 +15,7 @@ from facet.mapping.quantise import quantise
 from facet.mapping.region import SUMS, is_beside, is_one_pose, within, within_slab
 from facet.mapping.settings import BLOCK, MapSettings
 from facet.mapping.store import VoxelStore
-from facet.mapping.traces import COUNT, SCRATCH, begin, list_votes
+from facet.mapping.traces import COUNT, LOOK, begin, list_votes
 from mapping_logs import cloud
 
 SETTINGS = MapSettings(voxel_m=0.0625)
@@ -84,11 +84,11 @@ def listed(n: int, reach: int, across: int = 0) -> tuple[int, Word, np.recarray]
     """(what is seen of the n-th voxel of the block, its place, votes round it)."""
     keys, words, halo = place(across)
     own = np.flatnonzero(((keys >= 0) & (keys < BLOCK)).all(1))[n]
-    scratch = np.recarray(1, SCRATCH)[0]
-    begin(scratch.state)
+    look = np.recarray(1, LOOK)[0]
+    begin(reach, look.state)
     local = int(keys[own] @ [1, 8, 64])
-    assert list_votes((halo, WIDEST, local, int(words[own]), RULE), reach, scratch)
-    return int(words[own]), keys[own], scratch
+    assert list_votes((halo, WIDEST, local, int(words[own]), RULE), look)
+    return int(words[own]), keys[own], look
 
 
 @pytest.mark.parametrize("across", [0, 1])
@@ -98,11 +98,11 @@ def test_sums_are_those_of_the_definition(reach: int, across: int) -> None:
     keys, words, _ = place(across)
     some = 0
     for n in range(0, 120, 8):
-        seen, at, scratch = listed(n, reach, across)
+        seen, at, look = listed(n, reach, across)
         away = np.abs(keys - at).max(1)
         out = np.zeros(SUMS, np.int32)
         for r in range(1, reach + 1):
-            within(scratch.votes, scratch.state[COUNT], r, out)
+            within(look.votes, look.state[COUNT], r, out)
             counts = (away <= r) & beside(seen, words)
             assert out.tolist() == plain_sum(keys - at, words, counts), (n, r)
         own = np.array([seen & 15, (seen >> 4) & 15, (seen >> 8) & 15])
@@ -110,7 +110,7 @@ def test_sums_are_those_of_the_definition(reach: int, across: int) -> None:
         for normal in NORMALS:
             middle = int(own @ normal)
             for half in (384.0, 511.5, 1e9):
-                within_slab(scratch.votes, scratch.state[COUNT], reach, *normal, middle, half, out)
+                within_slab(look.votes, look.state[COUNT], reach, *normal, middle, half, out)
                 inside = np.abs(off @ normal - middle) < half
                 counts = (away <= reach) & inside & (views_of(words) @ normal > 0)
                 assert out.tolist() == plain_sum(keys - at, words, counts), (n, normal, half)
@@ -131,10 +131,10 @@ def test_one_pose_is_that_of_all_votes(reach: int, across: int) -> None:
     keys, words, _ = place(across)
     found = set()
     for n in range(120):
-        seen, at, scratch = listed(n, reach, across)
+        seen, at, look = listed(n, reach, across)
         poses = (words >> 32)[(np.abs(keys - at).max(1) <= reach) & beside(seen, words)]
         expected = len(set(poses.tolist())) == 1 and poses[0] != 0
-        one = is_one_pose(scratch.votes, scratch.poses, scratch.state[COUNT], reach)
+        one = is_one_pose(look.votes, look.poses, look.state[COUNT], reach)
         assert one == (expected and seen >> 32 != 0) or seen >> 32 == 0
         found.add(bool(one))
     assert found == {False, True}

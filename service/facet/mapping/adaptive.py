@@ -21,16 +21,21 @@ from facet.mapping.traces import (
     COUNT,
     FARTHEST,
     KNOWN,
+    RADIUS,
+    REACH,
     SLAB,
     SLAB_UNIT,
     THIN_SLAB,
+    VISITED,
+    VOTES,
+    WANTED,
     ask,
     list_votes,
     slab_key,
 )
 
 EMPTY, VALID, ALIGNED, THICK, SPARSE, MIXED = range(6)
-WIDER = 255  # no class: the voxel must look farther than its halo
+OPEN = 255  # no class: sums are wanted
 UNIT = 256  # normals are integers: a unit vector times this
 OUTLIER = 6  # a voxel with so many times fewer points than those round it has no normal
 GROWTHS = 1024  # numbers of votes that eq. 19 is tabulated for: beyond n_max it is the same
@@ -121,53 +126,56 @@ def _step(number, ratio, r, rule):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _find_radius(at, rule, scratch):  # type: ignore[no-untyped-def]
-    """Follow the radius until it repeats; of a cycle the smallest. (place of the sums, -1 where
-    it would leave the halo; radius; reach: the largest radius that was looked at)."""
-    kept, principal, state = scratch.kept, scratch.principal, scratch.state
-    r = rule.start
-    reach = r
-    visited = np.int64(0)
-    e = ask(at, r, reach, scratch)
-    while e >= 0:
-        visited |= np.int64(1) << r
+def _find_radius(at, rule, look):  # type: ignore[no-untyped-def]
+    """Follow the radius until it repeats, on from where it is; of a cycle the smallest. The place
+    of its sums, -1 where they are wanted."""
+    kept, principal, state = look.kept, look.principal, look.state
+    r, visited = state[RADIUS], state[VISITED]
+    e = ask(at, r, look)
+    while e >= 0 and (visited >> r) & 1 == 0:
+        visited |= 1 << r
         r_next = _step(np.int64(kept[e, 0]), principal[LAMBDA + e], r, rule)
-        if r_next == r or (visited >> r_next) & 1:
+        if (visited >> r_next) & 1:
             if r_next < r:
                 r = r_next
-                e = ask(at, r, reach, scratch)
+                e = ask(at, r, look)
             break
         r = r_next
-        reach = max(r, reach)
-        if reach > FARTHEST:
-            state[KNOWN] = 0
-        e = ask(at, r, reach, scratch)
-    return e, r, reach
+        if r > state[REACH]:
+            state[REACH] = r
+            if r > FARTHEST:
+                state[KNOWN] = 0
+        e = ask(at, r, look)
+    state[RADIUS], state[VISITED] = r, visited
+    return e
 
 
 @kernel(allocates=False)
-def estimate(at, scratch):  # type: ignore[no-untyped-def]
-    """(class, nx, ny, nz, gamma in half degrees, at a border, reach) of a voxel; class WIDER where
-    its halo is too narrow to tell.
+def estimate(at, look):  # type: ignore[no-untyped-def]
+    """(class, nx, ny, nz, gamma in half degrees, at a border, reach) of a voxel; class OPEN where
+    sums are wanted first: then it goes on from there.
 
     at: halo, its margin, the voxel's place in the block, its observable, rule."""
     _, _, _, seen, rule = at
-    votes, kept, state = scratch.votes, scratch.kept, scratch.state
+    votes, kept, state = look.votes, look.kept, look.state
     if seen == 0:
         return EMPTY, 0, 0, 0, 0, False, 0
-    whole, r, reach = _find_radius(at, rule, scratch)
-    one_line = seen >> 32 != 0
-    if whole < 0 or (one_line and not list_votes(at, reach, scratch)):
-        return WIDER, 0, 0, 0, 0, False, 0
+    whole, one_line = _find_radius(at, rule, look), seen >> 32 != 0
+    r, reach = state[RADIUS], state[REACH]
+    if whole < 0:
+        return OPEN, 0, 0, 0, 0, False, 0
+    if one_line and not list_votes(at, look):
+        state[WANTED] = VOTES
+        return OPEN, 0, 0, 0, 0, False, 0
     if kept[whole, 0] < rule.sparse:
         return SPARSE, 0, 0, 0, 0, False, reach
-    one_pose = one_line and is_one_pose(votes, scratch.poses, state[COUNT], r)
-    region = at, r, reach, one_pose
-    kind, nx, ny, nz, tan_gamma = _classify(whole, seen, one_pose, rule, scratch)
+    one_pose = one_line and is_one_pose(votes, look.poses, state[COUNT], r)
+    region = at, r, one_pose
+    kind, nx, ny, nz, tan_gamma = _classify(whole, seen, one_pose, rule, look)
     e = whole
     if kind != ALIGNED:
         kind, nx, ny, nz, tan_gamma, e = _look_closer(
-            region, kind, nx, ny, nz, tan_gamma, whole, scratch
+            region, kind, nx, ny, nz, tan_gamma, whole, look
         )
     if e < 0:
         return kind, 0, 0, 0, 255 if kind == THICK else 0, False, reach
@@ -186,14 +194,14 @@ def estimate(at, scratch):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _look_closer(region, kind, nx, ny, nz, tan_gamma, whole, scratch):  # type: ignore[no-untyped-def]
+def _look_closer(region, kind, nx, ny, nz, tan_gamma, whole, look):  # type: ignore[no-untyped-def]
     """Class and normal by the votes in the voxel's own slab: across the normal of the whole region,
     where that is thick of a smaller one, and where two surfaces meet in a thinner slab.
 
     Returns (class, normal, tan gamma, place of the sums that they are of, -1: there is none)."""
-    at, r, reach, one_pose = region
+    at, r, one_pose = region
     _, _, _, seen, rule = at
-    kept = scratch.kept
+    kept = look.kept
     number, of_whole = np.int64(kept[whole, 0]), tan_gamma  # of all that the region holds
     outlier = rule.outlier * ((seen >> 12) & 15) * number <= kept[whole, 1]  # few among many
     beside = kind == THICK and tan_gamma <= rule.tan_theta  # a plane, not on it: a noise shell
@@ -203,24 +211,24 @@ def _look_closer(region, kind, nx, ny, nz, tan_gamma, whole, scratch):  # type: 
     while True:
         passes = 1 if kind == VALID else rule.passes
         kind, nx, ny, nz, tan_gamma, e = _look_again(
-            region, nx, ny, nz, SLAB, passes, rule.sparse, scratch
+            region, nx, ny, nz, SLAB, passes, rule.sparse, look
         )
         first -= 1
         if e < 0 or kind == VALID or first < max(1, r - rule.shrink):
             break
-        e = ask(at, first, reach, scratch)
+        e = ask(at, first, look)
         if e < 0:
-            kind = WIDER
+            kind = OPEN
         if e < 0 or kept[e, 0] < rule.least_first:
             break
-        _, nx, ny, nz, _ = _classify(e, seen, one_pose, rule, scratch)
+        _, nx, ny, nz, _ = _classify(e, seen, one_pose, rule, look)
         kind = THICK
     nearly = kind == THICK and tan_gamma < rule.tan_mixed < of_whole
     dense = e >= 0 and kept[e, 1] >= rule.thin_points * kept[e, 0]  # sure enough for a thinner slab
     if nearly and dense and r > 1:  # a step: a narrow face between two
         least = (number + rule.thin_share - 1) // rule.thin_share
         kind, nx, ny, nz, tan_gamma, e = _look_again(
-            region, nx, ny, nz, THIN_SLAB, rule.thin_passes, least, scratch
+            region, nx, ny, nz, THIN_SLAB, rule.thin_passes, least, look
         )
         if kind == SPARSE:  # a slice of a lump
             kind = THICK
@@ -228,12 +236,12 @@ def _look_closer(region, kind, nx, ny, nz, tan_gamma, whole, scratch):  # type: 
 
 
 @kernel(allocates=False)
-def _look_again(region, nx, ny, nz, slab, passes, least, scratch):  # type: ignore[no-untyped-def]
+def _look_again(region, nx, ny, nz, slab, passes, least, look):  # type: ignore[no-untyped-def]
     """Class and normal again, and again: of the votes on the voxel's own side, by the last normal,
     and in its own slab. Returns what `_look_closer` does; SPARSE where these are fewer than
     `least`."""
-    at, r, reach, one_pose = region
-    seen, rule, kept = at[3], at[4], scratch.kept
+    at, r, one_pose = region
+    seen, rule, kept = at[3], at[4], look.kept
     kind, tan_gamma, e = SPARSE, 0.0, -1
     last = np.int64(-1)
     for _ in range(passes):
@@ -241,12 +249,12 @@ def _look_again(region, nx, ny, nz, slab, passes, least, scratch):  # type: igno
         if key == last:  # and so on for ever
             break
         last = key
-        e = ask(at, key, reach, scratch)
+        e = ask(at, key, look)
         if e < 0:
-            return WIDER, nx, ny, nz, 0.0, -1
+            return OPEN, nx, ny, nz, 0.0, -1
         if kept[e, 0] < least:
             return SPARSE, nx, ny, nz, 0.0, -1
-        kind, nx, ny, nz, tan_gamma = _classify(e, seen, one_pose, rule, scratch)
+        kind, nx, ny, nz, tan_gamma = _classify(e, seen, one_pose, rule, look)
     return kind, nx, ny, nz, tan_gamma, e
 
 
@@ -272,10 +280,10 @@ def _towards(seen, nx, ny, nz):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _classify(e, seen, one_pose, rule, scratch):  # type: ignore[no-untyped-def]
+def _classify(e, seen, one_pose, rule, look):  # type: ignore[no-untyped-def]
     """(class, normal towards the view, tan gamma) of the voxel with observable `seen`, by the sums
     at a place."""
-    sums, principal = scratch.kept[e], scratch.principal
+    sums, principal = look.kept[e], look.principal
     nx, ny, nz = principal[NX + e], principal[NY + e], principal[NZ + e]
     tan_gamma = principal[TAN_GAMMA + e]
     if _towards(seen, nx, ny, nz) < 0.0:

@@ -13,22 +13,25 @@ from numpy.typing import NDArray
 from facet.mapping.bits import population, trailing_zeros
 from facet.mapping.blocks import find, pack, unpack
 from facet.mapping.kernel import kernel
-from facet.mapping.lanes import LANES, load, store
+from facet.mapping.lanes import LANES, QUARTERS, load, store
 from facet.mapping.memory import sparse
 from facet.mapping.settings import BLOCK
 
 WIDEST = 20  # voxels that a halo may reach beyond its block on each side
 EDGE = BLOCK + 2 * WIDEST
 SIDE_BLOCKS = 7  # blocks along an edge of the widest halo
-COLUMNS = 4  # 16-bit numbers listed of a voxel: x, y, z, view. x, y and z are 16 x its place from
-# the corner of the halo + its centroid in it, 1/8 voxels; x has the weight of its vote from bit
-# IN_X on; the view is the observable's, and negative where that is of both sides
-IN_X = 10
+MOST = 8192  # votes of a region that are looked at: w x x of so many stay below 2^31
+# What is listed of a voxel, 16 bits each, in one number: x, y, z, view. x, y and z are 16 x its
+# place from the corner of the halo + its centroid in it, 1/8 voxels; x has the weight of its vote
+# from bit WEIGHT_IN_X on; the view is the observable's, and negative where that is of both sides
+IN_X, IN_Y, IN_Z, IN_VIEW = 0, 16, 32, 48
+WEIGHT_IN_X = 10
 
 
 HALO = np.dtype(  # scratch of one thread: the surroundings of one block at a time
     [
-        ("votes", np.int16, (COLUMNS, EDGE**3 + LANES)),  # of the occupied voxels, x fastest
+        ("votes", np.int64, (EDGE**3 + LANES,)),  # of the occupied voxels, x fastest
+        ("taken", np.int64, (MOST + LANES,)),  # those round one voxel
         ("poses", np.int32, (EDGE**3,)),  # likewise, the high halves of their observables
         ("words", np.int32, (EDGE**3,)),  # likewise, the low halves
         ("places", np.int32, (EDGE**3,)),  # likewise, packed
@@ -189,23 +192,20 @@ def gather(blocks, observable, block, margin, halo):  # type: ignore[no-untyped-
 
 @kernel(allocates=False)
 def _spread(words, places, count, votes):  # type: ignore[no-untyped-def]
-    """What votes say, from low halves of observables and packed places, into their columns."""
-    x, y, z, view = votes[0], votes[1], votes[2], votes[3]
-    for i in range(count):  # few columns a loop: the compiler must see that they do not overlap
-        word, place = words[i], places[i]
-        x[i] = (16 * (place & 255) + (word & 15)) | (((word >> 12) & 15) << IN_X)
-        y[i] = 16 * ((place >> 8) & 255) + ((word >> 4) & 15)
+    """What votes say, from low halves of observables and packed places."""
     for i in range(count):
-        word, place = words[i], places[i]
-        z[i] = 16 * (place >> 16) + ((word >> 8) & 15)
-        view[i] = word >> 16
+        word, place = np.int64(words[i]), np.int64(places[i])
+        x = 16 * (place & 255) | (word & 15) | (((word >> 12) & 15) << WEIGHT_IN_X)
+        y = 16 * ((place >> 8) & 255) | ((word >> 4) & 15)
+        z = 16 * (place >> 16) | ((word >> 8) & 15)
+        votes[i] = x | (y << IN_Y) | (z << IN_Z) | ((word >> 16) << IN_VIEW)
 
 
 @kernel(allocates=False)
-def take(halo, margin, x, y, z, r, most, poses_too, votes, poses):  # type: ignore[no-untyped-def]
-    """Copy what lies within r (Chebyshev, at most `margin`) of the voxel x, y, z of the block to
-    votes (>= COLUMNS, >= most + LANES), and to poses (most,) if `poses_too`. Returns how many; what
-    lies behind them means nothing."""
+def take(halo, margin, x, y, z, r, poses_too, poses):  # type: ignore[no-untyped-def]
+    """Copy what lies within r (Chebyshev, at most `margin`) of the voxel x, y, z of the block, at
+    most MOST, to halo.taken, and to poses (MOST,) if `poses_too`. Returns how many; what lies
+    behind them means nothing."""
     edge = BLOCK + 2 * margin
     if halo.along_y[0] != 0:
         x, y = y, x
@@ -221,11 +221,11 @@ def take(halo, margin, x, y, z, r, most, poses_too, votes, poses):  # type: igno
             row = halo.rows[line]
             start = halo.first[line] + np.int64(population(row & before))
             number = np.int64(population((row >> low) & cube))
-            if count + number > most:
+            if count + number > MOST:
                 return count
-            _copy(halo.votes, start, votes, count)  # mostly all, without asking
-            for i in range(LANES, number, LANES):
-                _copy(halo.votes, start + i, votes, count + i)
+            _copy(halo.votes, start, halo.taken, count)  # mostly all, without asking
+            for i in range(2 * QUARTERS, number, 2 * QUARTERS):
+                _copy(halo.votes, start + i, halo.taken, count + i)
             if poses_too:
                 for i in range(number):
                     poses[count + i] = halo.poses[start + i]
@@ -235,6 +235,7 @@ def take(halo, margin, x, y, z, r, most, poses_too, votes, poses):  # type: igno
 
 @kernel(allocates=False, inlined=True)
 def _copy(source, start, target, at):  # type: ignore[no-untyped-def]
-    """Copy LANES votes."""
-    for c in range(COLUMNS):
-        store(target[c], at, load(source[c], start))
+    """Copy 2 x QUARTERS votes."""
+    one, other = load(source, start), load(source, start + QUARTERS)
+    store(target, at, one)
+    store(target, at + QUARTERS, other)

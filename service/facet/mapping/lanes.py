@@ -28,6 +28,8 @@ LANES = 16
 _I16 = ir.VectorType(ir.IntType(16), LANES)
 _I32 = ir.VectorType(ir.IntType(32), LANES)
 _SUM = ir.VectorType(ir.IntType(32), LANES // 2)
+_I64 = ir.VectorType(ir.IntType(64), LANES)
+QUARTERS = LANES // 4  # 64-bit numbers that `load` and `store` move at a time
 
 
 class _Vector(types.Type):
@@ -96,15 +98,15 @@ for _operator, _build in _OPERATORS.items():
 _define(abs, (_LANES,), _absolute)
 
 
-def _address(context: Any, builder: Any, kinds: Any, args: Any) -> Any:
-    """Of LANES numbers from args[1] on in the array args[0]."""
+def _address(context: Any, builder: Any, kinds: Any, args: Any, kind: Any = _I16) -> Any:
+    """Of a register of that kind from args[1] on in the array args[0]."""
     array = context.make_array(kinds[0])(context, builder, args[0])
     at = context.cast(builder, args[1], kinds[1], types.intp)
-    return builder.bitcast(builder.gep(array.data, [at]), _I16.as_pointer())
+    return builder.bitcast(builder.gep(array.data, [at]), kind.as_pointer())
 
 
 def _load(typingctx: Any, column: Any, at: Any) -> Any:
-    """LANES numbers from column[at] on, column (N,) int16."""
+    """LANES numbers from column[at] on, column (N,) int16; or QUARTERS of int64, to store again."""
     del typingctx
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -114,7 +116,7 @@ def _load(typingctx: Any, column: Any, at: Any) -> Any:
 
 
 def _store(typingctx: Any, column: Any, at: Any, lanes: Any) -> Any:
-    """Write LANES numbers to column[at] and on, column (N,) int16."""
+    """Write LANES numbers to column[at] and on, column (N,) int16; or QUARTERS, of int64."""
     del typingctx
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
@@ -122,6 +124,22 @@ def _store(typingctx: Any, column: Any, at: Any, lanes: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(column, at, lanes), codegen
+
+
+def _load_part(typingctx: Any, column: Any, at: Any, low: Any) -> Any:
+    """Bits low .. low + 15 of LANES numbers from column[at] on, column (N,) int64."""
+    del typingctx
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        wide = builder.load(_address(context, builder, signature.args, args, _I64), align=8)
+        one = context.cast(builder, args[2], signature.args[2], types.int64)
+        first = builder.insert_element(
+            ir.Constant(_I64, [0] * LANES), one, ir.Constant(ir.IntType(32), 0)
+        )
+        shift = builder.shuffle_vector(first, first, ir.Constant(_I32, [0] * LANES))
+        return builder.trunc(builder.lshr(wide, shift), _I16)
+
+    return _LANES(column, at, low), codegen
 
 
 def _splat(typingctx: Any, number: Any) -> Any:
@@ -191,6 +209,7 @@ def _total(typingctx: Any, sums: Any) -> Any:
 
 
 load: Any = intrinsic(_load)
+load_part: Any = intrinsic(_load_part)
 store: Any = intrinsic(_store)
 splat: Any = intrinsic(_splat)
 larger: Any = intrinsic(_larger)

@@ -12,11 +12,11 @@ from facet.mapping.adaptive import (
     ALIGNED,
     EMPTY,
     MIXED,
+    OPEN,
     SPARSE,
     THICK,
     UNIT,
     VALID,
-    WIDER,
     estimate,
     make_rule,
 )
@@ -24,16 +24,18 @@ from facet.mapping.blocks import list_voxels
 from facet.mapping.halo import gather, make_halos
 from facet.mapping.kernel import kernel
 from facet.mapping.memory import Heap, Memory, grow_all, sparse
-from facet.mapping.principal import analyse_all
+from facet.mapping.principal import ABREAST, analyse_all, put, solve, take_over
 from facet.mapping.runs import dealt
 from facet.mapping.settings import MapSettings
 from facet.mapping.staleness import find_candidates, find_stale, mark_dirty
 from facet.mapping.store import Dirty, VoxelStore
 from facet.mapping.traces import (
     KNOWN,
+    LOOK,
     SCRATCH,
     amend,
     begin,
+    fetch,
     find_records,
     forget,
     keep,
@@ -59,11 +61,14 @@ class Normals(NamedTuple):
 
 
 @kernel(allocates=False)
-def _write(normals, rows, count, found):  # type: ignore[no-untyped-def]
-    """Write what was found of the voxels rows[:count]. Whether any is another now than before."""
+def _write(normals, rows, number, found):  # type: ignore[no-untyped-def]
+    """Write what was found of the voxels rows[:number]; of one that is OPEN, nothing was. Whether
+    any is another now than before."""
     changed = False
-    for v in range(count):
+    for v in range(number):
         row, new, unit = rows[v], found[v], normals.unit[rows[v]]
+        if new[0] == OPEN:
+            continue
         changed |= normals.kind[row] != new[0]
         changed |= unit[0] != new[1] or unit[1] != new[2] or unit[2] != new[3]
         changed |= normals.thickness[row] != new[4]
@@ -77,48 +82,98 @@ def _write(normals, rows, count, found):  # type: ignore[no-untyped-def]
 @kernel(allocates=False)
 def _estimate_block(  # type: ignore[no-untyped-def]
     blocks, observable, normals, block, stale, dirty, num_changes, rule, halo, traces, share,
-    scratch
+    scratch, looks
 ):  # fmt: skip
-    """Estimate the voxels of a block whose bit is set in stale (8,). Whether any changed. Its halo
-    is gathered when the first of them asks for it, and again, wider, when one looks farther.
+    """Estimate the voxels of a block whose bit is set in stale (8,). Whether any changed. Those
+    that want sums wait until all `looks` do: then these are fetched side by side. The halo is
+    gathered when the first is, and again, wider, when one looks farther.
 
     dirty (8,): bits of its dirty voxels; num_changes: dirty voxels round it, -1: too many."""
-    state, listed, found = scratch.state, scratch.listed, scratch.found
+    listed, found, opened = scratch.listed, scratch.found, scratch.open
     rows, places, words, starts = listed[0], listed[1], listed[2], listed[3]
     number = list_voxels(blocks, block, stale, rows, places)
     for v in range(number):
         words[v] = observable[rows[v]]
+        found[v, 0] = OPEN
     if num_changes >= 0:
         find_records(traces, share, rows, number, starts)
-    margin, count = 0, 0
+    for n in range(len(looks)):
+        opened[1, n] = n
+    margin, num_open = 0, 0
     for v in range(number):
-        row, local, seen = rows[v], places[v], words[v]
-        is_new = (dirty[local >> 6] >> np.uint64(local & 63)) & np.uint64(1) == 1
-        if is_new or num_changes < 0:
-            begin(state)
-        else:
-            is_whole = recall(traces, share, row, starts[v], scratch)
-            is_other = amend(num_changes, local, seen, rule, scratch)
-            one_line = seen >> 32 != 0  # asks for more than sums
-            if is_whole and not (is_other or one_line):
-                continue
-            analyse_all(scratch.kept, state[KNOWN], rule.floor2, scratch.principal)
-        kind = WIDER
-        while kind == WIDER:
-            at = halo, margin, local, seen, rule
-            kind, nx, ny, nz, gamma, border, reach = estimate(at, scratch)
-            if kind == WIDER:
+        look = looks[opened[1, num_open]]
+        if _begin(dirty, num_changes, rule, traces, share, v, scratch, look):
+            at = halo, margin, places[v], words[v], rule
+            opened[0, num_open] = v
+            num_open += _is_open(at, num_changes, traces, share, v, scratch, look)
+        while num_open == len(looks) or (v == number - 1 and num_open > 0):
+            margin = _fetch_all(
+                blocks, observable, block, margin, rule, halo, num_open, scratch, looks
+            )
+            num_left = 0
+            for n in range(num_open):
+                own, place = opened[0, n], opened[1, n]
+                opened[1, n] = opened[1, num_left]
+                opened[0, num_left], opened[1, num_left] = own, place
+                at = halo, margin, places[own], words[own], rule
+                num_left += _is_open(at, num_changes, traces, share, own, scratch, looks[place])
+            num_open = num_left
+    return _write(normals, rows, number, found)
+
+
+@kernel(allocates=False, inlined=True)
+def _begin(dirty, num_changes, rule, traces, share, v, scratch, look):  # type: ignore[no-untyped-def]
+    """Begin to look at a voxel of the block. Whether it can have changed."""
+    state, listed = look.state, scratch.listed
+    row, local, seen, start = listed[0, v], listed[1, v], listed[2, v], listed[3, v]
+    begin(rule.start, state)
+    is_new = (dirty[local >> 6] >> np.uint64(local & 63)) & np.uint64(1) == 1
+    if is_new or num_changes < 0:
+        return True
+    is_whole = recall(traces, share, row, start, look)
+    is_other = amend(scratch.changes, num_changes, local, seen, rule, look)
+    one_line = seen >> 32 != 0  # asks for more than sums
+    if is_whole and not (is_other or one_line):
+        return False
+    analyse_all(look.kept, state[KNOWN], rule.floor2, look.principal)
+    return True
+
+
+@kernel(allocates=False, inlined=True)
+def _is_open(at, num_changes, traces, share, v, scratch, look):  # type: ignore[no-untyped-def]
+    """Estimate a voxel of the block. Whether it wants sums first."""
+    row, start, found = scratch.listed[0, v], scratch.listed[3, v], scratch.found[v]
+    kind, nx, ny, nz, gamma, border, reach = estimate(at, look)
+    found[0], found[1], found[2], found[3] = kind, nx, ny, nz
+    found[4], found[5], found[6] = gamma, border, reach
+    if kind == OPEN:
+        return True
+    if num_changes < 0:
+        forget(traces, share, row)
+    else:
+        keep(traces, share, row, start, look)
+    return False
+
+
+@kernel(allocates=False)
+def _fetch_all(  # type: ignore[no-untyped-def]
+    blocks, observable, block, margin, rule, halo, num_open, scratch, looks
+):  # fmt: skip
+    """Fetch what looks want, and find what it says, of all side by side. The margin of the halo."""
+    opened, listed = scratch.open, scratch.listed
+    for n in range(num_open):
+        v, look, e = opened[0, n], looks[opened[1, n]], np.int64(-1)
+        while e < 0:
+            e = fetch((halo, margin, listed[1, v], listed[2, v], rule), look)
+            if e < 0:
                 margin = _wider(margin, rule.largest)
                 gather(blocks, observable, block, margin, halo)
-        found[count, 0], found[count, 1], found[count, 2], found[count, 3] = kind, nx, ny, nz
-        found[count, 4], found[count, 5], found[count, 6] = gamma, border, reach
-        if num_changes < 0:
-            forget(traces, share, row)
-        else:
-            keep(traces, share, row, starts[v], scratch)
-        rows[count] = row
-        count += 1
-    return _write(normals, rows, count, found)
+        put(look.kept[e], n, scratch.principal)
+        opened[2, n] = e
+    solve(num_open, rule.floor2, scratch.principal)
+    for n in range(num_open):
+        take_over(scratch.principal, n, looks[opened[1, n]].principal, opened[2, n])
+    return margin
 
 
 @kernel(allocates=False)
@@ -142,7 +197,7 @@ def _deepest(blocks, reach, block, listed):  # type: ignore[no-untyped-def]
 @kernel(parallel=True)
 def _refresh(  # type: ignore[no-untyped-def]
     blocks, columns, normals, deepest, dirty, changes, which, rules, halos, scratches, traces,
-    counts, turned,
+    looks, counts, turned,
 ):  # fmt: skip
     """Estimate again what is stale in the blocks `which` (C,); counts (C,) says how many voxels,
     turned (C,) whether any of them changed. dirty: (B, 8) bits of dirty voxels; changes: these as
@@ -170,7 +225,7 @@ def _refresh(  # type: ignore[no-untyped-def]
                 )
                 turned[q] = _estimate_block(
                     blocks, columns.observable, normals, block, stale, dirty[block], num, rule,
-                    halo, traces, share, scratch,
+                    halo, traces, share, scratch, looks[share],
                 )  # fmt: skip
                 deepest[1 + block] = _deepest(blocks, normals.reach, block, scratch.listed)
 
@@ -194,6 +249,7 @@ class NormalField:
         self._first = np.zeros(0, np.int32)  # dirty voxels by block, see mark_dirty
         self._flags = np.zeros(0, np.bool_)
         self._halos, self._scratches = make_halos(SHARES), sparse(SHARES, SCRATCH)
+        self._looks = sparse(SHARES * ABREAST, LOOK).reshape(SHARES, ABREAST)
         self._traces = make_traces(SHARES)
 
     def restore(self, store: VoxelStore, normals: Normals) -> None:
@@ -223,7 +279,7 @@ class NormalField:
         counts, turned = np.empty(len(which), np.int32), np.empty(len(which), np.bool_)
         _refresh(
             store.blocks, store.columns, self.normals, self._deepest, self._dirty, changes, which,
-            self._rule, self._halos, self._scratches, self._traces, counts, turned,
+            self._rule, self._halos, self._scratches, self._traces, self._looks, counts, turned,
         )  # fmt: skip
         self._dirty[sources] = 0
         self._first[sources] = 0

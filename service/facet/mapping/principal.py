@@ -53,14 +53,32 @@ def analyse(kept, e, floor2, principal):  # type: ignore[no-untyped-def]
 
 @kernel(allocates=False)
 def analyse_all(kept, count, floor2, principal):  # type: ignore[no-untyped-def]
-    """What the sums kept[:count] say, and what lies behind them up to a full set of lanes: that is
-    nonsense, and as fast."""
-    lanes = (count + ABREAST - 1) // ABREAST * ABREAST
-    for e in range(lanes):
-        a, b, c, d, f, g = _covariance(kept[e])
-        principal[XX + e], principal[YY + e], principal[ZZ + e] = a, b, c
-        principal[XY + e], principal[XZ + e], principal[YZ + e] = d, f, g
-    for e in range(lanes):
+    """What the sums kept[:count] say."""
+    for e in range(count):
+        put(kept[e], e, principal)
+    solve(count, floor2, principal)
+
+
+@kernel(allocates=False, inlined=True)
+def put(sums, e, principal):  # type: ignore[no-untyped-def]
+    """Put the covariance of sums at a place: `solve` tells what they say."""
+    a, b, c, d, f, g = _covariance(sums)
+    principal[XX + e], principal[YY + e], principal[ZZ + e] = a, b, c
+    principal[XY + e], principal[XZ + e], principal[YZ + e] = d, f, g
+
+
+@kernel(allocates=False, inlined=True)
+def take_over(source, at, principal, e):  # type: ignore[no-untyped-def]
+    """What was found at a place of another array, to a place."""
+    for column in (LAMBDA, TAN_GAMMA, NX, NY, NZ):
+        principal[column + e] = source[column + at]
+
+
+@kernel(allocates=False)
+def solve(count, floor2, principal):  # type: ignore[no-untyped-def]
+    """What was put at the places up to `count` says, and what lies behind them up to a full set of
+    lanes: that is nonsense, and as fast."""
+    for e in range((count + ABREAST - 1) // ABREAST * ABREAST):
         ratio, tan_gamma, nx, ny, nz = _analyse(
             principal[XX + e], principal[YY + e], principal[ZZ + e],
             principal[XY + e], principal[XZ + e], principal[YZ + e], floor2,

@@ -9,11 +9,20 @@ from __future__ import annotations
 
 import numpy as np
 
-from facet.mapping.halo import IN_X
+from facet.mapping.halo import IN_VIEW, IN_X, IN_Y, IN_Z, WEIGHT_IN_X
 from facet.mapping.kernel import kernel
-from facet.mapping.lanes import LANES, add_products, larger, load, no_sums, splat, store, total
+from facet.mapping.lanes import (
+    LANES,
+    add_products,
+    larger,
+    load,
+    load_part,
+    no_sums,
+    splat,
+    store,
+    total,
+)
 
-MOST = 8192  # votes of a region that are looked at: w x x of so many stay below 2^31
 FACED = 9  # columns of votes as a voxel sees them: centroids from its corner, 1/8 voxels; weights;
 # views; -1 where these are of its side, else 0; how far it is to their voxels (Chebyshev)
 X, Y, Z, WEIGHT, VIEW_X, VIEW_Y, VIEW_Z, SIDE, DISTANCE = range(FACED)
@@ -22,18 +31,19 @@ SUMS = 11  # number, weight, w x, y, z, w xx, xy, xz, yy, yz, zz
 
 
 @kernel(allocates=False)
-def face(votes, count, seen, i0, j0, k0):  # type: ignore[no-untyped-def]
-    """See votes (FACED, >= count + LANES), listed round a voxel at place (i0, j0, k0) in its halo,
-    as that voxel does: what was listed gives way.
+def face(taken, count, seen, i0, j0, k0, votes):  # type: ignore[no-untyped-def]
+    """See the votes taken[:count], round a voxel at place (i0, j0, k0) in its halo, as that voxel
+    does: votes (FACED, >= count + LANES).
 
     seen: its observable. A vote is of its side where their views differ by less than 120 degrees;
     where the voxel itself was seen from opposite sides, every vote is, until a normal is known."""
     vx, vy, vz = ((seen >> 16) & 31) - 8, ((seen >> 21) & 31) - 8, ((seen >> 26) & 31) - 8
     length2, any_side = vx * vx + vy * vy + vz * vz, splat(-((seen >> 31) & 1))
     for i in range(0, count, LANES):
-        x, y, z, view = load(votes[0], i), load(votes[1], i), load(votes[2], i), load(votes[3], i)
-        store(votes[WEIGHT], i, x >> IN_X)
-        x = x & ((1 << IN_X) - 1)
+        x, y = load_part(taken, i, IN_X), load_part(taken, i, IN_Y)
+        z, view = load_part(taken, i, IN_Z), load_part(taken, i, IN_VIEW)
+        store(votes[WEIGHT], i, x >> WEIGHT_IN_X)
+        x = x & ((1 << WEIGHT_IN_X) - 1)
         i_place, j_place, k_place = x >> 4, y >> 4, z >> 4
         di, dj, dk = i_place - i0, j_place - j0, k_place - k0
         store(votes[DISTANCE], i, larger(larger(abs(di), abs(dj)), abs(dk)))

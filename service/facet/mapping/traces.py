@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from facet.mapping.bits import population
-from facet.mapping.halo import take
+from facet.mapping.halo import MOST, take
 from facet.mapping.kernel import kernel
 from facet.mapping.lanes import LANES
 from facet.mapping.memory import sparse
-from facet.mapping.principal import PLACES, PRINCIPAL, analyse
-from facet.mapping.region import FACED, MOST, SUMS, face, is_beside, within, within_slab
+from facet.mapping.principal import ABREAST, PLACES, PRINCIPAL, analyse
+from facet.mapping.region import FACED, SUMS, face, is_beside, within, within_slab
 from facet.mapping.settings import VOXELS
 
 SLAB_UNIT = 64  # the normal across a slab is rounded: these integers are a unit vector times this
@@ -30,8 +30,12 @@ MOST_KEPT = 12  # sums of a voxel
 PASSING = MOST_KEPT  # place of sums that are not kept, until the next are asked for
 ENTRIES = 96 << 10  # sums of a share that are kept: those begun last
 MOST_CHANGES = 256  # dirty voxels round a block; with more, summing all again is no slower
-KNOWN, USED, LISTED, COUNT, WHOLE = range(5)  # state: sums at hand; a bit each of those asked for;
-# radius up to which the votes are listed; how many these are; whether nothing asked for was dropped
+STATE = 10  # numbers of the state of a look: sums at hand; a bit each of those asked for; radius up
+# to which the votes are listed; how many these are; whether nothing asked for was dropped; the
+# radius, the largest one until now and a bit each of those that were looked at; the key of the sums
+# that are wanted; whether these are fetched at once
+KNOWN, USED, LISTED, COUNT, WHOLE, RADIUS, REACH, VISITED, WANTED, ALONE = range(STATE)
+VOTES = -1  # wanted are the votes alone
 KEY = SUMS  # an entry: the sums, what they are of, and where those of a voxel begin, else 0:
 OWNER, ROOM, NUMBER, IS_WHOLE = range(KEY + 1, KEY + 5)  # 1 + row; how many have room; how many
 # there are; whether they are all that the last estimate asked for
@@ -59,15 +63,22 @@ def make_traces(shares: int) -> Traces:
     )
 
 
-SCRATCH = np.dtype(  # what a thread needs to estimate voxels; a record goes from loop to loop as
-    # one address, its arrays by themselves as half a dozen numbers each
+LOOK = np.dtype(  # what an estimate of a voxel needs; a record goes from loop to loop as one
+    # address, its arrays by themselves as half a dozen numbers each
     [
         ("votes", np.int16, (FACED, MOST + 5 * LANES)),  # round a voxel; columns start on
         # different cache sets
         ("poses", np.int32, (MOST,)),  # likewise
         ("kept", np.int32, (PLACES, KEY + 1)),  # sums at hand, each with its key
         ("principal", np.float64, (PRINCIPAL,)),  # what these say
-        ("state", np.int64, (5,)),  # KNOWN .. WHOLE
+        ("state", np.int64, (STATE,)),  # KNOWN .. ALONE
+    ],
+    align=True,
+)
+SCRATCH = np.dtype(  # what a thread needs of a block
+    [
+        ("principal", np.float64, (PRINCIPAL,)),  # what sums of several looks say
+        ("open", np.int64, (3, ABREAST)),  # voxels that want sums, their looks, and places of these
         ("changes", np.int64, (5, MOST_CHANGES)),  # dirty voxels round a block: x, y, z from its
         # corner, observable before and now
         ("listed", np.int64, (4, VOXELS)),  # voxels of the block
@@ -95,72 +106,89 @@ def _read_key(key):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def list_votes(at, reach, scratch):  # type: ignore[no-untyped-def]
-    """List the votes within reach. Whether the halo is wide enough."""
+def list_votes(at, look):  # type: ignore[no-untyped-def]
+    """List the votes within reach. Whether the halo is wide enough.
+
+    at: halo, its margin, the voxel's place in the block, its observable, rule."""
     halo, margin, local, seen, _ = at
-    votes, state = scratch.votes, scratch.state
+    votes, state = look.votes, look.state
+    reach = state[REACH]
     if state[LISTED] >= reach:
         return True
     if reach > margin:
         return False
     x, y, z = local & 7, (local >> 3) & 7, local >> 6
-    count = take(halo, margin, x, y, z, reach, MOST, seen >> 32 != 0, votes, scratch.poses)
-    face(votes, count, seen, x + margin, y + margin, z + margin)
+    count = take(halo, margin, x, y, z, reach, seen >> 32 != 0, look.poses)
+    face(halo.taken, count, seen, x + margin, y + margin, z + margin, votes)
     state[LISTED], state[COUNT] = reach, count
     return True
 
 
 @kernel(allocates=False)
-def ask(at, key, reach, scratch):  # type: ignore[no-untyped-def]
-    """Bring the sums that a key names, and what they say, to hand. Their place there; -1 where the
-    halo is too narrow.
-
-    at: halo, its margin, the voxel's place in the block, its observable, rule; reach: the largest
-    radius that was asked for, up to which votes are listed."""
-    votes, kept, state = scratch.votes, scratch.kept, scratch.state
+def ask(at, key, look):  # type: ignore[no-untyped-def]
+    """The place at hand of the sums that a key names, and of what they say. -1: they are wanted.
+    Who is told so fetches them, and estimates the voxel again; where most are at hand already, that
+    would take longer than to fetch one alone."""
+    kept, state = look.kept, look.state
     for e in range(state[KNOWN]):
         if kept[e, KEY] == key:
             state[USED] |= 1 << e
             return e
-    if not list_votes(at, reach, scratch):
+    state[WANTED] = key
+    if _find_place(state) != PASSING and not state[ALONE]:
         return -1
-    _, _, _, seen, rule = at
-    e = _find_place(reach, state)
+    e = fetch(at, look)  # those that are PASSING would not be there again
+    if e >= 0:
+        analyse(kept, e, at[4].floor2, look.principal)
+    return e
+
+
+@kernel(allocates=False)
+def fetch(at, look):  # type: ignore[no-untyped-def]
+    """Bring the sums that are wanted to hand. Their place; -1 where the halo is too narrow."""
+    votes, kept, state = look.votes, look.kept, look.state
+    if not list_votes(at, look):
+        return -1
+    key, e = state[WANTED], _find_place(state)
+    if key == VOTES:
+        return PASSING
+    if e == PASSING:
+        state[WHOLE] = 0
+    else:
+        state[KNOWN] = max(state[KNOWN], e + 1)
+        state[USED] |= 1 << e
     kept[e, KEY] = key
     r, kind, ix, iy, iz = _read_key(key)
     if kind == CUBE:
         within(votes, state[COUNT], r, kept[e])
     else:
+        _, _, _, seen, rule = at
         own = ix * (seen & 15) + iy * ((seen >> 4) & 15) + iz * ((seen >> 8) & 15)
         half = rule.slab if kind == SLAB else rule.thin_slab
         within_slab(votes, state[COUNT], r, ix, iy, iz, own, half, kept[e])
-    analyse(kept, e, rule.floor2, scratch.principal)
     return e
 
 
 @kernel(allocates=False)
-def _find_place(reach, state):  # type: ignore[no-untyped-def]
+def _find_place(state):  # type: ignore[no-untyped-def]
     """A place for sums that are not at hand: a free one, or of sums not asked for this time, or
     PASSING."""
-    e = 0
-    if state[KNOWN] < MOST_KEPT:
-        e = state[KNOWN]
-    else:
-        while e < MOST_KEPT and (state[USED] >> e) & 1:
-            e += 1
-    if reach > FARTHEST or e == MOST_KEPT:
-        state[WHOLE] = 0
+    if state[REACH] > FARTHEST:
         return PASSING
-    state[KNOWN] = max(state[KNOWN], e + 1)
-    state[USED] |= 1 << e
-    return e
+    if state[KNOWN] < MOST_KEPT:
+        return state[KNOWN]
+    e = 0
+    while e < MOST_KEPT and (state[USED] >> e) & 1:
+        e += 1
+    return e  # MOST_KEPT is PASSING
 
 
 @kernel(allocates=False)
-def begin(state):  # type: ignore[no-untyped-def]
-    """Nothing is at hand."""
-    state[KNOWN] = state[USED] = state[LISTED] = 0
+def begin(start, state):  # type: ignore[no-untyped-def]
+    """Nothing is at hand; the first radius is `start`."""
+    state[KNOWN] = state[USED] = state[LISTED] = state[VISITED] = state[ALONE] = 0
     state[WHOLE] = 1
+    state[RADIUS] = state[REACH] = start
 
 
 @kernel(allocates=False)
@@ -181,15 +209,14 @@ def _is_record(traces, share, row, start):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def recall(traces, share, row, start, scratch):  # type: ignore[no-untyped-def]
+def recall(traces, share, row, start, look):  # type: ignore[no-untyped-def]
     """Bring what is kept of a voxel, and began at `start`, to hand. Whether it is all that the last
     estimate asked for."""
-    kept, state = scratch.kept, scratch.state
-    begin(state)
+    kept, state = look.kept, look.state
     if not _is_record(traces, share, row, start):
         return False
     entries = traces.entries[share]
-    state[KNOWN] = entries[start, NUMBER]
+    state[KNOWN], state[ALONE] = entries[start, NUMBER], 1
     for e in range(state[KNOWN]):
         for s in range(KEY + 1):
             kept[e, s] = entries[start + e, s]
@@ -197,9 +224,9 @@ def recall(traces, share, row, start, scratch):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def keep(traces, share, row, start, scratch):  # type: ignore[no-untyped-def]
+def keep(traces, share, row, start, look):  # type: ignore[no-untyped-def]
     """Keep those sums at hand that were asked for, in place of those that began at `start`."""
-    kept, state = scratch.kept, scratch.state
+    kept, state = look.kept, look.state
     number = 0
     for e in range(state[KNOWN]):
         number += (state[USED] >> e) & 1
@@ -273,10 +300,10 @@ def list_changes(blocks, columns, bits, dirty, near, blocks_out, changes):  # ty
 
 
 @kernel(allocates=False)
-def amend(num_changes, local, seen, rule, scratch):  # type: ignore[no-untyped-def]
+def amend(changes, num_changes, local, seen, rule, look):  # type: ignore[no-untyped-def]
     """Bring the sums at hand from what the changed voxels were to what they are. Whether any sum is
     another now."""
-    kept, state, changes = scratch.kept, scratch.state, scratch.changes
+    kept, state = look.kept, look.state
     farthest = 0
     for e in range(state[KNOWN]):
         farthest = max(farthest, kept[e, KEY] & 31)
