@@ -131,10 +131,10 @@ def test_one_pose_is_that_of_all_votes(reach: int, across: int) -> None:
     keys, words, _ = place(across)
     found = set()
     for n in range(120):
-        seen, at, look = listed(n, reach, across)
+        seen, at, _ = listed(n, reach, across)
         poses = (words >> 32)[(np.abs(keys - at).max(1) <= reach) & beside(seen, words)]
         expected = len(set(poses.tolist())) == 1 and poses[0] != 0
-        one = is_one_pose(look.votes, look.poses, look.state[COUNT], reach)
+        one = is_one_pose(place(across)[2], WIDEST, *at.tolist(), reach, seen)
         assert one == (expected and seen >> 32 != 0) or seen >> 32 == 0
         found.add(bool(one))
     assert found == {False, True}

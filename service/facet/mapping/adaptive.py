@@ -18,19 +18,17 @@ from facet.mapping.principal import LAMBDA, NX, NY, NZ, TAN_GAMMA
 from facet.mapping.region import is_one_pose
 from facet.mapping.settings import STEPS, MapSettings
 from facet.mapping.traces import (
-    COUNT,
     FARTHEST,
     KNOWN,
+    POSES,
     RADIUS,
     REACH,
     SLAB,
     SLAB_UNIT,
     THIN_SLAB,
     VISITED,
-    VOTES,
     WANTED,
     ask,
-    list_votes,
     slab_key,
 )
 
@@ -156,20 +154,22 @@ def estimate(at, look):  # type: ignore[no-untyped-def]
     sums are wanted first: then it goes on from there.
 
     at: halo, its margin, the voxel's place in the block, its observable, rule."""
-    _, _, _, seen, rule = at
-    votes, kept, state = look.votes, look.kept, look.state
+    halo, margin, local, seen, rule = at
+    kept, state = look.kept, look.state
     if seen == 0:
         return EMPTY, 0, 0, 0, 0, False, 0
     whole, one_line = _find_radius(at, rule, look), seen >> 32 != 0
     r, reach = state[RADIUS], state[REACH]
     if whole < 0:
         return OPEN, 0, 0, 0, 0, False, 0
-    if one_line and not list_votes(at, look):
-        state[WANTED] = VOTES
+    if one_line and margin < reach:
+        state[WANTED] = POSES
         return OPEN, 0, 0, 0, 0, False, 0
     if kept[whole, 0] < rule.sparse:
         return SPARSE, 0, 0, 0, 0, False, reach
-    one_pose = one_line and is_one_pose(votes, look.poses, state[COUNT], r)
+    one_pose = one_line and is_one_pose(
+        halo, margin, local & 7, (local >> 3) & 7, local >> 6, r, seen
+    )
     region = at, r, one_pose
     kind, nx, ny, nz, tan_gamma = _classify(whole, seen, one_pose, rule, look)
     e = whole

@@ -202,10 +202,9 @@ def _spread(words, places, count, votes):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def take(halo, margin, x, y, z, r, poses_too, poses):  # type: ignore[no-untyped-def]
-    """Copy what lies within r (Chebyshev, at most `margin`) of the voxel x, y, z of the block, at
-    most MOST, to halo.taken, and to poses (MOST,) if `poses_too`. Returns how many; what lies
-    behind them means nothing."""
+def take(halo, margin, x, y, z, r):  # type: ignore[no-untyped-def]
+    """Copy the votes within r (Chebyshev, at most `margin`) of the voxel x, y, z of the block, at
+    most MOST, to halo.taken. Returns how many; what lies behind them means nothing."""
     edge = BLOCK + 2 * margin
     if halo.along_y[0] != 0:
         x, y = y, x
@@ -226,9 +225,6 @@ def take(halo, margin, x, y, z, r, poses_too, poses):  # type: ignore[no-untyped
             _copy(halo.votes, start, halo.taken, count)  # mostly all, without asking
             for i in range(2 * QUARTERS, number, 2 * QUARTERS):
                 _copy(halo.votes, start + i, halo.taken, count + i)
-            if poses_too:
-                for i in range(number):
-                    poses[count + i] = halo.poses[start + i]
             count += number
     return count
 

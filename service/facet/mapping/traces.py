@@ -35,7 +35,7 @@ STATE = 10  # numbers of the state of a look: sums at hand; a bit each of those 
 # radius, the largest one until now and a bit each of those that were looked at; the key of the sums
 # that are wanted; whether these are fetched at once
 KNOWN, USED, LISTED, COUNT, WHOLE, RADIUS, REACH, VISITED, WANTED, ALONE = range(STATE)
-VOTES = -1  # wanted are the votes alone
+POSES = -1  # wanted are no sums, but the poses in the halo
 KEY = SUMS  # an entry: the sums, what they are of, and where those of a voxel begin, else 0:
 OWNER, ROOM, NUMBER, IS_WHOLE = range(KEY + 1, KEY + 5)  # 1 + row; how many have room; how many
 # there are; whether they are all that the last estimate asked for
@@ -68,7 +68,6 @@ LOOK = np.dtype(  # what an estimate of a voxel needs; a record goes from loop t
     [
         ("votes", np.int16, (FACED, MOST + 5 * LANES)),  # round a voxel; columns start on
         # different cache sets
-        ("poses", np.int32, (MOST,)),  # likewise
         ("kept", np.int32, (PLACES, KEY + 1)),  # sums at hand, each with its key
         ("principal", np.float64, (PRINCIPAL,)),  # what these say
         ("state", np.int64, (STATE,)),  # KNOWN .. ALONE
@@ -111,14 +110,13 @@ def list_votes(at, look):  # type: ignore[no-untyped-def]
 
     at: halo, its margin, the voxel's place in the block, its observable, rule."""
     halo, margin, local, seen, _ = at
-    votes, state = look.votes, look.state
-    reach = state[REACH]
+    votes, state, reach = look.votes, look.state, look.state[REACH]
     if state[LISTED] >= reach:
         return True
     if reach > margin:
         return False
     x, y, z = local & 7, (local >> 3) & 7, local >> 6
-    count = take(halo, margin, x, y, z, reach, seen >> 32 != 0, look.poses)
+    count = take(halo, margin, x, y, z, reach)
     face(halo.taken, count, seen, x + margin, y + margin, z + margin, votes)
     state[LISTED], state[COUNT] = reach, count
     return True
@@ -147,11 +145,11 @@ def ask(at, key, look):  # type: ignore[no-untyped-def]
 def fetch(at, look):  # type: ignore[no-untyped-def]
     """Bring the sums that are wanted to hand. Their place; -1 where the halo is too narrow."""
     votes, kept, state = look.votes, look.kept, look.state
+    key, e = state[WANTED], _find_place(state)
+    if key == POSES:
+        return PASSING if state[REACH] <= at[1] else -1
     if not list_votes(at, look):
         return -1
-    key, e = state[WANTED], _find_place(state)
-    if key == VOTES:
-        return PASSING
     if e == PASSING:
         state[WHOLE] = 0
     else:
