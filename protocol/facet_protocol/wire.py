@@ -34,6 +34,8 @@ def parse(message_type: type[M], payload: bytes | memoryview) -> M:
 
 
 def _varint(data: memoryview, position: int) -> tuple[int, int]:
+    if position < len(data) and data[position] < 0x80:  # as most are
+        return data[position], position + 1
     value = 0
     for shift in range(0, 70, 7):
         if position >= len(data):

@@ -81,6 +81,9 @@ class SequenceLedger:
         if sequence == 0:
             return Noted(True)
         epochs = self._seen[source]
+        if self._current.get(source) == epoch and epochs[epoch].last == sequence - 1:
+            epochs[epoch].ends[-1] = sequence
+            return Noted(True, 0, sequence)
         is_restart = bool(epochs) and epoch not in epochs
         is_interleaved = epoch in epochs and epoch != self._current[source]
         self._current[source] = epoch
