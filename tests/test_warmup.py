@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
+
+from facet.mapping.kernel import KEPT, make_room
 
 DRIVE = """
 import gc, logging, sys
@@ -42,3 +45,19 @@ def test_a_robot_waits_for_no_compiler(tmp_path: Path) -> None:
         command, cwd=Path(__file__).parent, capture_output=True, text=True, check=False
     )
     assert ended.returncode == 0, ended.stderr
+
+
+def test_a_new_cache_takes_the_place_of_the_oldest(tmp_path: Path) -> None:
+    """Each edit of the sources, and each version, has one of its own."""
+    for age in range(1, 6):
+        (tmp_path / f"kernels-{age}").mkdir()
+        (tmp_path / f"kernels-{age}" / "loop.nbc").write_text("compiled")
+        os.utime(tmp_path / f"kernels-{age}", (1e9 - age, 1e9 - age))
+    (tmp_path / "mapper.pyc").write_text("not ours")
+    assert make_room(tmp_path / "kernels-3")  # it is there: nothing goes
+    assert len(list(tmp_path.glob("kernels-*"))) == 5
+    assert make_room(tmp_path / "kernels-new")
+    assert {p.name for p in tmp_path.glob("kernels-*")} == {"kernels-new", "kernels-1", "kernels-2"}
+    assert KEPT == 3
+    assert (tmp_path / "mapper.pyc").exists()
+    assert not make_room(tmp_path / "mapper.pyc" / "kernels-new")  # nor can one lie there

@@ -4,7 +4,9 @@ loop calls may have changed, which the compiler's own cache would not notice."""
 from __future__ import annotations
 
 import hashlib
+import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +16,25 @@ from numba import njit
 _HERE = Path(__file__).parent
 _NAME = hashlib.sha256(b"".join(p.read_bytes() for p in sorted(_HERE.glob("*.py")))).hexdigest()
 CACHE = _HERE / "__pycache__" / f"kernels-{_NAME[:16]}"
+KEPT = 3  # caches, that of these sources and the newest of others: each takes 24 MB
 
 
-def _writable() -> bool:
-    """Whether the cache can lie beside the sources; else the compiler finds a place of its own."""
+def make_room(cache: Path) -> bool:
+    """Whether the cache can lie beside the sources; else the compiler finds a place of its own. A
+    new one takes the place of the oldest."""
+    is_new = not cache.exists()
     try:
-        CACHE.mkdir(parents=True, exist_ok=True)
+        cache.mkdir(parents=True, exist_ok=True)
     except OSError:
         return False
+    with suppress(OSError):
+        others = [other for other in cache.parent.glob("kernels-*") if other != cache]
+        for old in sorted(others, key=lambda p: p.stat().st_mtime)[: 1 - KEPT] if is_new else ():
+            shutil.rmtree(old)
     return True
 
 
-_WRITABLE = _writable()
+_WRITABLE = make_room(CACHE)
 
 
 def kernel(
