@@ -5,6 +5,8 @@ from __future__ import annotations
 import logging
 import os
 import re
+import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -95,6 +97,47 @@ def test_a_reader_that_goes_away_ends_nothing(pipe: tuple[int, int]) -> None:
     write_lines(book, 3)
     book.close()
     assert book.num_dropped == 3
+
+
+def test_the_next_reader_is_told_of_every_line_that_was_lost(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "log")
+    reader = os.open(tmp_path / "log", os.O_RDONLY | os.O_NONBLOCK)
+    writer = os.open(tmp_path / "log", os.O_WRONLY)
+    os.close(reader)
+    book = Logbook(writer)
+    write_lines(book, 5)
+    wait_until(lambda: book.num_dropped == 5, 20)
+    reader = os.open(tmp_path / "log", os.O_RDONLY | os.O_NONBLOCK)
+    os.set_blocking(reader, True)
+    write_lines(book, 2)
+    book.close()
+    os.close(writer)
+    text = read_all(reader)
+    os.close(reader)
+    assert text.count(" line ") == 2
+    assert text.count("(5 lines of log were dropped") == text.count("dropped") == 1
+
+
+def test_a_message_that_cannot_be_formatted_ends_nobody(pipe: tuple[int, int]) -> None:
+    book = Logbook(pipe[1])
+    logger = logging.Logger("facet.test")
+    logger.addHandler(book)
+    logger.info("%d scans", "three")
+    book.close()
+    os.close(pipe[1])
+    assert "facet.test: '%d scans' cannot be formatted" in read_all(pipe[0])
+
+
+def test_no_other_file_is_taken_for_a_closed_standard_error(tmp_path: Path) -> None:
+    """The next file that is opened has its number."""
+    program = (
+        "import logging, sys; from facet.logbook import keep_log; own = open(sys.argv[1], 'w');"
+        "assert own.fileno() == 2; keep_log(); logging.warning('not for this file');"
+        "logging.shutdown(); own.write('data')"
+    )
+    command = f'"{sys.executable}" -c "{program}" "{tmp_path / "data"}" 2>&-'
+    assert subprocess.run(command, shell=True, check=False).returncode == 0
+    assert (tmp_path / "data").read_text() == "data"
 
 
 def test_a_service_goes_on_when_nobody_reads_its_log(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import re
 import sys
 
@@ -22,6 +23,7 @@ from facet.commands.simulate import simulate
 from facet.commands.talk import cmd, status, top
 from facet.commands.terminal import Exit, InputError, err, out
 from facet.config import ConfigError
+from facet.logbook import Logbook
 from facet.session import DEFAULT_ENDPOINT
 from facet.sources.mcap_damage import LogError
 from facet_protocol.messages import ProtocolError
@@ -84,7 +86,12 @@ def _run() -> int:
 
 
 def _fail(code: Exit, error: Exception) -> Exit:
-    err.print(f"facet: {_said(error)}", style="bold red", markup=False)
+    text = f"facet: {_said(error)}"
+    books = [handler for handler in logging.root.handlers if isinstance(handler, Logbook)]
+    for book in books:  # where standard error may be a pipe that nobody reads
+        book.say(text)
+    if not books:
+        err.print(text, style="bold red", markup=False)
     return code
 
 

@@ -81,9 +81,10 @@ class SequenceLedger:
         if sequence == 0:
             return Noted(True)
         epochs = self._seen[source]
-        if self._current.get(source) == epoch and epochs[epoch].last == sequence - 1:
-            epochs[epoch].ends[-1] = sequence
-            return Noted(True, 0, sequence)
+        ends = epochs[epoch].ends if epoch in epochs else []
+        if ends and ends[-1] == sequence - 1 and self._current.get(source) == epoch:
+            ends[-1] = sequence
+            return Noted(True, 0, sequence)  # the next one, as most are
         is_restart = bool(epochs) and epoch not in epochs
         is_interleaved = epoch in epochs and epoch != self._current[source]
         self._current[source] = epoch

@@ -143,6 +143,7 @@ def serve(config: Config) -> Exit:
                 model = service.stop()
                 if model is not None:
                     write_model(model, config.record.directory / "model.json")
+        service.account.set_counter("log_lines_dropped", book.num_dropped)
         return _conclude(service, model)
 
 

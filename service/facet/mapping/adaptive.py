@@ -33,7 +33,7 @@ from facet.mapping.traces import (
 )
 
 EMPTY, VALID, ALIGNED, THICK, SPARSE, MIXED = range(6)
-OPEN = 255  # no class: sums are wanted
+OPEN = 255  # no class: sums are wanted, or poses
 UNIT = 256  # normals are integers: a unit vector times this
 OUTLIER = 6  # a voxel with so many times fewer points than those round it has no normal
 GROWTHS = 1024  # numbers of votes that eq. 19 is tabulated for: beyond n_max it is the same

@@ -31,10 +31,10 @@ WEIGHT_IN_X = 10
 HALO = np.dtype(  # scratch of one thread: the surroundings of one block at a time
     [
         ("votes", np.int64, (EDGE**3 + LANES,)),  # of the occupied voxels, x fastest
-        ("taken", np.int64, (MOST + LANES,)),  # those round one voxel
         ("poses", np.int32, (EDGE**3,)),  # likewise, the high halves of their observables
         ("words", np.int32, (EDGE**3,)),  # likewise, the low halves
         ("places", np.int32, (EDGE**3,)),  # likewise, packed
+        ("taken", np.int64, (MOST + LANES,)),  # of the votes those round one voxel
         ("along_y", np.int8, (1,)),  # whether rows are
         ("rows", np.uint64, (EDGE**2,)),  # a bit per x of the row (z, y), y fastest; or x for y
         ("first", np.int32, (EDGE**2,)),  # where the row starts in the list

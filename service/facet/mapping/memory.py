@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import mmap
 from collections.abc import Iterator
+from contextlib import suppress
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
@@ -62,7 +63,8 @@ def sparse(count: int, dtype: DTypeLike) -> Column:
     flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
     room = mmap.mmap(-1, count * kind.itemsize, flags)
     if hasattr(mmap, "MADV_NOHUGEPAGE"):
-        room.madvise(mmap.MADV_NOHUGEPAGE)
+        with suppress(OSError):  # from a system that has none
+            room.madvise(mmap.MADV_NOHUGEPAGE)
     return np.frombuffer(room, kind)
 
 

@@ -105,7 +105,7 @@ def _estimate_block(  # type: ignore[no-untyped-def]
         if _begin(dirty, num_changes, rule, traces, share, v, scratch, look):
             at = halo, margin, places[v], words[v], rule
             opened[0, num_open] = v
-            num_open += _is_open(at, num_changes, traces, share, v, scratch, look)
+            num_open += _estimate(at, num_changes, traces, share, v, scratch, look)
         while num_open == len(looks) or (v == number - 1 and num_open > 0):
             margin = _fetch_all(
                 blocks, observable, block, margin, rule, halo, num_open, scratch, looks
@@ -116,7 +116,7 @@ def _estimate_block(  # type: ignore[no-untyped-def]
                 opened[1, n] = opened[1, num_left]
                 opened[0, num_left], opened[1, num_left] = own, place
                 at = halo, margin, places[own], words[own], rule
-                num_left += _is_open(at, num_changes, traces, share, own, scratch, looks[place])
+                num_left += _estimate(at, num_changes, traces, share, own, scratch, looks[place])
             num_open = num_left
     return _write(normals, rows, number, found)
 
@@ -140,8 +140,8 @@ def _begin(dirty, num_changes, rule, traces, share, v, scratch, look):  # type: 
 
 
 @kernel(allocates=False, inlined=True)
-def _is_open(at, num_changes, traces, share, v, scratch, look):  # type: ignore[no-untyped-def]
-    """Estimate a voxel of the block. Whether it wants sums first."""
+def _estimate(at, num_changes, traces, share, v, scratch, look):  # type: ignore[no-untyped-def]
+    """Estimate a voxel of the block, and keep its sums. Whether it is still open."""
     row, start, found = scratch.listed[0, v], scratch.listed[3, v], scratch.found[v]
     kind, nx, ny, nz, gamma, border, reach = estimate(at, look)
     found[0], found[1], found[2], found[3] = kind, nx, ny, nz

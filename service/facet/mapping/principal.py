@@ -1,7 +1,7 @@
 """What the sums of a region's votes say (eq. 2-10, 18): its shape, its thickness, its normal.
 
-Those of a voxel are taken eight side by side, in vector registers: one after the other each would
-wait for the roots and quotients of the one before.
+Those of a voxel, or of as many voxels, are taken eight side by side, in vector registers: one after
+the other each would wait for the roots and quotients of the one before.
 """
 
 from __future__ import annotations

@@ -178,7 +178,7 @@ def _message(sample: zenoh.Sample) -> Message | None:
 
 
 def main(arguments: list[str] | None = None) -> None:
-    """Follow until a signal; ends within EXIT_S, also when the viewer does not take its data."""
+    """Follow until a signal; ends soon, also when the viewer does not take its data."""
     parser = argparse.ArgumentParser(prog="python -m facet.sinks.viewer")
     parser.add_argument("endpoint", help="tcp/127.0.0.1:7447")
     parser.add_argument("map")
