@@ -12,6 +12,7 @@ import numpy as np
 from benchmarks import buildings, inside
 from benchmarks.buildings import Looks
 from benchmarks.figures import Figure, at_least, at_most
+from benchmarks.machine import ceilings
 from facet.commands.terminal import table
 from facet.mapping.mapper import Mapper
 from facet.pipeline import Stopwatch
@@ -102,7 +103,10 @@ def _judge(rows: list[list[Detail]], voxels: list[int], ripe: float) -> list[Fig
     whole = np.array([c["stages"].get(WHOLE, 0.0) for c in rows[1]])
     sizes = [f"{n / 1e6:.2g} M voxels" for n in voxels]
     stale = np.median([c["work"]["stale_voxels"] for c in rows[1]])
+    now = ceilings(2, quick=False)  # neighbours on the same host may take a half of it
     return [
+        Figure("this machine, now: streamed by two threads, GB/s", now["bytes"] / 1e9),
+        Figure("the same: cache lines fetched at random, M/s", now["lines"] / 1e6),
         at_least("mean points of a voxel in view before", ripe, RIPE),
         Figure(f"update after a 32 k scan, {sizes[0]}, median, ms", float(np.median(totals[0]))),
         Figure(f"update after a 32 k scan, {sizes[1]}, median, ms", float(np.median(totals[1]))),
