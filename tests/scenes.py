@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from facet.simulate import SCENES, SENSORS, Noise, Observer, Scene, Sensor, Simulation, Truth
 from facet.simulate.drive import Drive
-from facet.simulate.surfaces import Opening, box, level_rectangle, room_walls
+from facet.simulate.surfaces import Opening, TruthSurface, box, level_rectangle, room_walls, wall
 from facet_protocol.messages import LineFan, Pose, Scan, ScanKind
 from facet_protocol.scans import project
 
@@ -83,6 +83,34 @@ def room() -> Scene:
         (0.9, 1.6, 0.0),
     ]
     return Scene("room", tuple(surfaces), Drive(np.array(waypoints))).moved(12.0, (-1.3, 0.7, 0.2))
+
+
+def columns() -> Scene:
+    """7 x 5 x 2.5 m with a round column and a pillar of six faces, each half a metre wide."""
+    size = (0.0, 7.0), (0.0, 5.0)
+    surfaces = [
+        level_rectangle("floor", *size, 0.0, looks_up=True),
+        level_rectangle("ceiling", *size, 2.5, looks_up=False),
+        *room_walls("room", *size, (0.0, 2.5), {}),
+        *_prism("column", (2.2, 2.5), 0.6, 24, planar=False),
+        *_prism("pillar", (4.8, 2.5), 0.5, 6, planar=True),
+    ]
+    waypoints = [(1, 1, 0), (6, 0.9, 0), (6.1, 4.0, 0), (0.9, 4.1, 0), (0.8, 1.6, 0)]
+    drive = Drive(np.array(waypoints, np.float64))
+    return Scene("columns", tuple(surfaces), drive).moved(12.0, (-1.3, 0.7, 0.2))
+
+
+def _prism(
+    name: str, centre: tuple[float, float], radius: float, faces: int, *, planar: bool
+) -> list[TruthSurface]:
+    """The faces of an upright prism, seen from outside."""
+    angle = np.linspace(0.3, 0.3 + 2.0 * np.pi, faces + 1)
+    ring = np.asarray(centre) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    corners = [(float(x), float(y)) for x, y in ring]
+    return [
+        wall(f"{name} {i}", corners[i], corners[i + 1], (0.0, 2.5), planar=planar)
+        for i in range(faces)
+    ]
 
 
 def recorded(name: str, limit: int | None = None) -> Iterator[Scan]:

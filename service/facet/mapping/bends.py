@@ -1,9 +1,9 @@
 """Planes that are none: strips too narrow to have a normal, and strips of something curved.
 
-On a plane the members' normals do not depend on where they are; along a curved wall, or over a
-bevelled edge, they turn steadily. Whatever turns goes to the remainder (design 3.4). At the edges
-of a narrow plane points of the faces beyond turn the normals as well, mostly so that it seems to
-bulge; so where a narrow strip has members enough they are asked whether they lie on an arc, too.
+A curved wall, or a round column, comes as strips side by side, each turned against the next about
+the line between them, and within each the members' normals turn on the same way. Whatever turns
+goes to the remainder (design 3.4). Neither alone says so: at the edges of a narrow plane points of
+the faces beyond turn the normals of its members as much, and the faces of a bay stand at an angle.
 
 Nor is a strip a plane whose members lie along its two sides with nothing between: the rims of the
 two faces of a free-standing wall.
@@ -30,13 +30,12 @@ from facet.mapping.tiles import TileField
 
 SUMS = 22  # n; sum x (3), xx (6); sum u (3), u x (9): x in 1/8 voxels, u normals times UNIT
 UNKNOWN = -1
-ARC = 9  # n; sum s, ss, sss, ssss, h, hh, hs, hss: 1/8 voxels across, 1/64 voxels off the plane
-ARC_WIDTH = 10.0  # voxels: a narrower strip
-ARC_VOTES = 200  # of so many members at least is bent where its normals turn so that it
-HOLLOWED_DEG = 10.5  # is hollow by this,
-ASKED_DEG = 8.5  # or by this, or bulges by `bend_deg`, and they lie on an arc
-ARC_DEG = 5.0  # that turns by this the same way
-ARC_SIGMAS = 3.5  # surely
+ACROSS = 5  # n; sum s, ss, sss, ssss: 1/8 voxels across a strip
+STEADY = 0.4  # of the angle to the next strip: by so much at least the normals in a strip turn
+APART = 0.15  # chord of an angle: two strips that stand at a smaller one are one, split by noise
+PARALLEL = 0.95  # cosine: of the line between two strips and the length of one
+BESIDE = 0.3  # of the longer one's length: by so much at most two strips are shifted along it
+ALIKE = 0.3  # of a strip's members: the next one has as many at least
 FULL = 0.45  # voxels for each that a strip spans: something lies between its sides
 EMPTY = 0.8  # bimodality across a strip: 1 of two lines, 0.56 where it is filled evenly
 GAP_WIDTH = 4.0  # voxels: a narrower strip has no place for that
@@ -110,29 +109,23 @@ def _copy_sums(old, old_starts, place, starts, sums):  # type: ignore[no-untyped
 
 
 @kernel(allocates=False)
-def _add_heights(store, normals, patches, rows, plane_of, origin, axes, pure, sums):  # type: ignore[no-untyped-def]
-    """Likewise add to sums (K, ARC) where members are across the strip, and how far off its plane.
-    axes: (K, 6) unit vectors across it and along its normal; pure: (K,) of pure members alone."""
+def _add_places(store, patches, rows, plane_of, origin, spans, sums):  # type: ignore[no-untyped-def]
+    """Likewise add to sums (K, ACROSS) where members with a normal are across the strip."""
     blocks, columns = store
     for m in range(rows.shape[0]):
         row, k = rows[m], plane_of[m]
-        if patches.member[row] < 0 or (pure[k] and not _is_pure(normals, patches, row)):
+        if patches.member[row] < 0:
             continue
         x, y, z = centroid(blocks, columns, row)
         x, y, z = x - origin[k, 0], y - origin[k, 1], z - origin[k, 2]
-        u = axes[k]
-        s = np.int64(np.floor(u[0] * x + u[1] * y + u[2] * z + 0.5))
-        h = np.int64(np.floor(8.0 * (u[3] * x + u[4] * y + u[5] * z) + 0.5))
+        across = spans[k]
+        s = np.int64(np.floor(across[2] * x + across[3] * y + across[4] * z + 0.5))
         ss = s * s
         sums[k, 0] += 1
         sums[k, 1] += s
         sums[k, 2] += ss
         sums[k, 3] += ss * s
         sums[k, 4] += ss * ss
-        sums[k, 5] += h
-        sums[k, 6] += h * h
-        sums[k, 7] += h * s
-        sums[k, 8] += h * ss
 
 
 class Kept(NamedTuple):
@@ -145,25 +138,30 @@ class Kept(NamedTuple):
 
 @kernel
 def _spans(votes, scatter):  # type: ignore[no-untyped-def]
-    """(K, 2) width and length of planes, voxels."""
-    out = np.empty((votes.shape[0], 2))
+    """(K, 8) width and length of planes, voxels, and unit vectors across and along them."""
+    out = np.zeros((votes.shape[0], 8))
     for k in range(votes.shape[0]):
+        a, b, c, d, e, f = scatter[k]
         _, _, _, _, middle, largest = smallest(scatter[k])
         out[k, 0] = np.sqrt(12.0 * max(0.0, middle) / votes[k])
         out[k, 1] = np.sqrt(12.0 * max(0.0, largest) / votes[k])
+        across, along = (
+            eigenvector(a, d, f, b, c, e, middle), eigenvector(a, d, f, b, c, e, largest)
+        )  # fmt: skip
+        for i in range(3):
+            out[k, 2 + i], out[k, 5 + i] = across[i], along[i]
     return out
 
 
 @kernel
-def _turns(sums):  # type: ignore[no-untyped-def]
-    """(K, 2, 8) how much the members' normals turn over the width of a plane, and over its length:
-    the angle, radians, positive where it bulges, the width, voxels, that direction and the plane's
-    normal; all 0 where there is none."""
-    out = np.zeros((sums.shape[0], 2, 8))
-    mean, unit, xx, normal = np.empty(3), np.empty(3), np.empty(6), np.empty(3)
+def _turns(sums, least):  # type: ignore[no-untyped-def]
+    """(K,) how much the normals of pure members turn over the width of a plane, radians, positive
+    where it bulges; 0 where there are fewer than `least`."""
+    out = np.zeros(sums.shape[0])
+    mean, unit, xx = np.empty(3), np.empty(3), np.empty(6)
     for k in range(sums.shape[0]):
         own = sums[k]
-        if own[0] == 0:
+        if own[0] < least:
             continue
         n = float(own[0])
         s = 0
@@ -173,36 +171,52 @@ def _turns(sums):  # type: ignore[no-untyped-def]
             for b in range(a, 3):
                 xx[s] = own[4 + s] / n - mean[a] * mean[b]
                 s += 1
-        _, normal[0], normal[1], normal[2], middle, largest = smallest(xx)
-        side = normal[0] * unit[0] + normal[1] * unit[1] + normal[2] * unit[2]
-        for way in range(2):
-            variance = largest if way else middle
-            if variance < 1.0:
-                continue
-            axis = eigenvector(xx[0], xx[3], xx[5], xx[1], xx[2], xx[4], variance)
-            slope = 0.0
-            for a in range(3):
-                for b in range(3):
-                    ux = own[13 + 3 * a + b] / n / UNIT - unit[a] * mean[b]
-                    slope += axis[a] * ux * axis[b]
-                out[k, way, 2 + a] = axis[a]
-                out[k, way, 5 + a] = normal[a] if side >= 0.0 else -normal[a]
-            width = np.sqrt(12.0 * variance)
-            out[k, way, 0], out[k, way, 1] = slope / variance * width, width / STEPS
+        _, _, _, _, middle, _ = smallest(xx)
+        if middle < 1.0:
+            continue
+        axis = eigenvector(xx[0], xx[3], xx[5], xx[1], xx[2], xx[4], middle)
+        slope = 0.0
+        for a in range(3):
+            for b in range(3):
+                ux = own[13 + 3 * a + b] / n / UNIT - unit[a] * mean[b]
+                slope += axis[a] * ux * axis[b]
+        out[k] = slope / middle * np.sqrt(12.0 * middle)
     return out
 
 
-def _arc(own: NDArray[np.int64], width: float) -> tuple[float, float]:
-    """(angle, radians, by which the parabola through the members turns over the width, positive
-    where it bulges; its standard deviation)."""
-    n = float(own[0])
-    s, ss, sss, ssss, h, hh, hs, hss = own[1:] / n
-    s2, h2, hs1 = ss - s * s, hh - h * h, hs - h * s
-    s3, s4, hs2 = sss - ss * s, ssss - ss * ss, hss - h * ss
-    own_s4 = s4 - s3 * s3 / s2
-    bow = (hs2 - hs1 * s3 / s2) / own_s4
-    rest = h2 - hs1 * hs1 / s2 - bow * bow * own_s4
-    return -2.0 * bow * width, 2.0 * width * float(np.sqrt(max(rest, 0.0) / (n * own_s4)))
+@kernel(allocates=False)
+def _goes_on(nodes, spans, turn, p, q):  # type: ignore[no-untyped-def]
+    """Whether a strip p, whose normals turn by `turn`, goes on in a strip q, turning."""
+    u, v, d, own = nodes.unit[p], nodes.unit[q], nodes.mean, spans[p]
+    a = np.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
+    b = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
+    x, y, z = v[0] / b - u[0] / a, v[1] / b - u[1] / a, v[2] / b - u[2] / a
+    i, j, k = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
+    dx, dy, dz = d[q, 0] - d[p, 0], d[q, 1] - d[p, 1], d[q, 2] - d[p, 2]
+    chord = np.sqrt(x * x + y * y + z * z)
+    shifted = abs(dx * own[5] + dy * own[6] + dz * own[7])
+    is_parallel = abs(i * own[5] + j * own[6] + k * own[7]) >= PARALLEL * np.sqrt(
+        i * i + j * j + k * k
+    )
+    bulges = x * dx + y * dy + z * dz > 0.0
+    return (
+        nodes.votes[q] >= ALIKE * nodes.votes[p]
+        and chord >= APART
+        and is_parallel
+        and shifted <= BESIDE * max(own[1], spans[q, 1])
+        and (turn if bulges else -turn) >= STEADY * chord
+    )
+
+
+@kernel
+def _bent(pairs, nodes, spans, turns):  # type: ignore[no-untyped-def]
+    """(K,) whether a strip goes on in one of those that it makes up pairs (E, 2) with, turning."""
+    out = np.zeros(turns.shape[0], np.bool_)
+    for e in range(pairs.shape[0]):
+        p, q = pairs[e, 0], pairs[e, 1]
+        out[p] |= _goes_on(nodes, spans, turns[p], p, q)
+        out[q] |= _goes_on(nodes, spans, turns[q], q, p)
+    return out
 
 
 def _bimodality(own: NDArray[np.int64]) -> float:
@@ -213,13 +227,6 @@ def _bimodality(own: NDArray[np.int64]) -> float:
     m3 = float(sss - 3.0 * s * ss + 2.0 * s**3)
     m4 = float(ssss - 4.0 * s * sss + 6.0 * s * s * ss - 3.0 * s**4)
     return (m3 * m3 + m2**3) / (m4 * m2) if m2 > 0.0 else 0.0
-
-
-def _axes(scatter: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(6,) unit vectors across a strip and along its normal."""
-    _, nx, ny, nz, middle, _ = smallest(scatter)
-    a, d, e, b, f, c = scatter
-    return np.array([*eigenvector(a, b, c, d, e, f, middle), nx, ny, nz])
 
 
 class Bends:
@@ -255,43 +262,26 @@ class Bends:
         """(K,) whether a plane is wide enough to be one and, if it is a strip, not bent.
 
         label: (T,) plane of each tile-plane of the table; nodes, occupation: of the K planes."""
-        widths, lengths = _spans(nodes.votes, nodes.scatter).T
+        spans = _spans(nodes.votes, nodes.scatter)
+        widths, lengths = spans[:, 0], spans[:, 1]
         flat = widths >= self._settings.min_width
         strips = flat & (widths < self._settings.strip_width)
         origin = np.floor(nodes.mean * STEPS).astype(np.int64)
-        sums = self._sums(table, label, strips, origin)
-        limit = np.radians(self._settings.bend_deg)
-        turns = _turns(sums)
-        across, width, along = turns[:, 0, 0], turns[:, 0, 1], turns[:, 1, 0]
-        judged = strips & (sums[:, 0] >= self._settings.n_min)
-        narrow = (width < ARC_WIDTH) & (sums[:, 0] >= ARC_VOTES)
-        low, high = (
-            np.where(narrow, -np.radians(HOLLOWED_DEG), -limit),
-            np.where(narrow, np.inf, limit),
-        )
-        straight = (np.abs(along) <= limit) & (low <= across) & (across <= high)
-        flat &= straight | ~judged
-        asked = (across < -np.radians(ASKED_DEG)) | (across > limit)
-        pure = judged & straight & narrow & asked  # they may lie on an arc
-        hollow = occupation < FULL * widths * lengths
-        thin = strips & flat & ~pure & (widths >= GAP_WIDTH) & hollow
-        axes = turns[:, 0, 2:].copy()
-        for plane in np.flatnonzero(thin).tolist():
-            axes[plane] = _axes(nodes.scatter[plane])
-        heights = np.zeros((len(origin), ARC), np.int64)
-        own = _nodes_of(label, pure | thin)
-        rows, sizes = self._members(table, own)
-        _add_heights(*self._voxels, rows, np.repeat(label[own], sizes), origin, axes, pure, heights)
-        for plane in np.flatnonzero(pure).tolist():
-            angle, deviation = _arc(heights[plane], float(width[plane]))
-            least = max(np.radians(ARC_DEG), ARC_SIGMAS * deviation)
-            flat[plane] = angle * np.sign(across[plane]) <= least
+        turns = _turns(self._sums(table, label, strips, origin), self._settings.n_min)
+        flat &= ~_bent(_pairs(table, label, strips), nodes, spans, turns)
         numbers = np.full(len(flat) + 1, FREE)  # FREE finds the last one
         bent = np.flatnonzero(strips & ~flat)
         numbers[bent] = np.arange(len(bent))
         self.bent = numbers[label]
+        hollow = occupation < FULL * widths * lengths
+        thin = strips & flat & (widths >= GAP_WIDTH) & hollow
+        across = np.zeros((len(flat), ACROSS), np.int64)
+        own = _nodes_of(label, thin)
+        rows, sizes = self._members(table, own)
+        store, _, patches = self._voxels
+        _add_places(store, patches, rows, np.repeat(label[own], sizes), origin, spans, across)
         for plane in np.flatnonzero(thin).tolist():
-            flat[plane] = _bimodality(heights[plane]) < EMPTY
+            flat[plane] = _bimodality(across[plane]) < EMPTY
         return np.asarray(flat)
 
     def _sums(
@@ -347,3 +337,12 @@ def _nodes_of(label: NDArray[np.int64], asked: NDArray[np.bool_]) -> NDArray[np.
     """Tile-planes of the planes that are asked for (K,)."""
     held = np.flatnonzero(label >= 0)
     return held[asked[label[held]]]
+
+
+def _pairs(table: Table, label: NDArray[np.int64], asked: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """(E, 2) planes that touch, of those that are asked for (K,), ascending."""
+    numbers = np.append(np.where(asked, np.arange(len(asked)), FREE), FREE)  # FREE finds the last
+    first, second = numbers[label[table.edges.T]]
+    on = (first != FREE) & (second != FREE) & (first != second)
+    low, high = np.minimum(first, second)[on], np.maximum(first, second)[on]
+    return np.stack(np.divmod(np.unique(low << 32 | high), 1 << 32), axis=1)

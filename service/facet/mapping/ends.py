@@ -17,7 +17,7 @@ from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.merging import NARROW
 from facet.mapping.normals import UNIT
-from facet.mapping.planes import ENOUGH_POINTS, FREE, PlaneSet, PointFit, pool_points
+from facet.mapping.planes import FREE, PlaneSet, PointFit, pool_points
 from facet.mapping.settings import STEPS, MapSettings
 from facet.mapping.store import centroid
 from facet.mapping.table import Table
@@ -29,6 +29,7 @@ OUTWARD = (
 )  # rings are moved outward by so much: the outline shall end where the plane does
 BESIDE = 1.0  # voxels off the plane: no patch of it is farther off
 STEEPEST = 1.0  # squared slope of a strip that touches its plane
+ENOUGH_POINTS = 200  # pure points that say where a strip lies
 LEAST_STRIPS = 3  # of an arc: the two faces of a bevelled edge lie on one, too
 ROUNDS = 12
 TINY = 1e-6  # voxels^2

@@ -22,7 +22,7 @@ from facet.mapping.table import Table
 
 FREE = -1
 ADOPTIONS = 10  # rounds in which freed tile-planes are offered to the planes beside them
-ENOUGH_POINTS = 200  # pure points that a plane is fitted to
+ENOUGH_POINTS = 1000  # pure points that a plane is fitted to; with fewer the voxels, one vote each
 
 
 Judge = Callable[[Table, NDArray[np.int64], Nodes, NDArray[np.int64]], NDArray[np.bool_]]

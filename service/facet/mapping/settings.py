@@ -65,8 +65,7 @@ class MapSettings:
     max_merged_sigma: float = 0.5
     min_area_m2: float = 0.25  # n_occ is never above this many square metres of voxels
     min_width: float = 2.5  # a narrower strip has no normal of its own
-    strip_width: float = 24.0  # a narrower plane is a strip, which must not be bent
-    bend_deg: float = 12.0  # that the normals of a strip may turn across it
+    strip_width: float = 24.0  # a narrower plane is a strip, which may be one of something curved
     member_share: float = 0.5  # of n_occ, that must be voxels with a valid normal
     min_surface_m2: float = 0.05
     # free space

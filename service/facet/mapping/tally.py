@@ -18,6 +18,8 @@ from facet.mapping.sums import SUMS, count_points, read_sums, shift_moments
 
 STRAY = 0.47  # voxels: a voxel whose centroid is so far off its tile-plane is not fitted to
 RIMMED = (12.0, 40.0)  # voxels: a tile-plane of such a width may be tilted by its rim
+SLIM = (2.5, 4.0)  # voxels: a tile-plane of such a width is nearly all rim, and the middle says no
+# tilt; what is less wide was cut off by the tile's border
 CORE = 0.3  # voxels: centroids so near say where it truly lies
 ROUNDS = 4
 FEW = 30  # voxels say nothing
@@ -139,10 +141,16 @@ def _shift(columns, row, corner, sums, points):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
+def _is_slim(facing):  # type: ignore[no-untyped-def]
+    return SLIM[0] <= facing[4] < SLIM[1]
+
+
+@kernel(allocates=False)
 def _look(sources, held, r, corner, plane, tally, t, sums, fresh):  # type: ignore[no-untyped-def]
     """Find what the members of a run are to their tile-plane, and change its PURE points by it:
     add them, where they are `fresh`. Sets the margin."""
     _, columns, border, second = sources
+    slim = _is_slim(tally.facing[t])
     margin = SURE
     for m in range(held.start[r], held.start[r] + held.size[r]):
         if held.state[m] == CLAIMED:
@@ -150,7 +158,7 @@ def _look(sources, held, r, corner, plane, tally, t, sums, fresh):  # type: igno
         row = held.rows[m]
         local, seen = np.int64(columns.local[row]), columns.observable[row]
         now = MIXED
-        if not (border[row] or second[row] >= 0):
+        if slim or not (border[row] or second[row] >= 0):
             off = (
                 plane[0] * (corner[0] + (local & 7) + (seen & 15) / STEPS)
                 + plane[1] * (corner[1] + ((local >> 3) & 7) + ((seen >> 4) & 15) / STEPS)
@@ -292,7 +300,7 @@ def _finish(  # type: ignore[no-untyped-def]
     elif RIMMED[0] <= f[4] <= RIMMED[1]:
         plane = _settled(_sound(sources, held, span, tile_key), plane)
     tally.planes[t, 0], tally.planes[t, 1], tally.planes[t, 2], tally.planes[t, 3] = plane
-    moved = o < 0
+    moved, turned = o < 0, o >= 0 and _is_slim(f) != _is_slim(old.facing[o])
     for a in range(4 * (not moved)):
         moved |= tally.planes[t, a] != old.planes[o, a]
     sums = np.empty(SUMS, np.int64)
@@ -302,7 +310,7 @@ def _finish(  # type: ignore[no-untyped-def]
         other = held.old[r] <= OTHER and not fresh
         if other:
             _merge(sources, before, OTHER - held.old[r], held, r, corner, tally, t, sums)
-        look = fresh or other or flags[held.block[r]] & LOOK != 0
+        look = fresh or other or turned or flags[held.block[r]] & LOOK != 0
         if moved and not look:
             held.margin[r] -= np.float32(_drift(corner, old.planes[o], plane) + SLACK)
             look = held.margin[r] <= 0.0
@@ -333,9 +341,9 @@ def tally_points(  # type: ignore[no-untyped-def]
     place, earlier, anew, old, tally, same, was
 ):  # fmt: skip
     """Sum the points of the tile-planes of tiles (N,) about the tile's corner, without those that
-    hold points of others: at a border, claimed by a plane at an angle, or STRAY from their
-    tile-plane. A tile-plane neither narrow nor wide is settled first: the rim of a table's top
-    tilts it.
+    hold points of others: STRAY from their tile-plane and, but for SLIM ones, at a border or
+    claimed by a plane at an angle. A tile-plane neither narrow nor wide is settled first: the rim
+    of a table's top tilts it.
 
     before, held: the members then and now; planes:
     (N + 1, 2) where a tile's old tile-planes begin, and its new ones; into: (O,) what the old ones
