@@ -279,7 +279,7 @@ def find_ends(
     """Where tile-planes end beside strips that are bent. bent: (T,) the strip that each tile-plane
     is part of, FREE where it is of none; points: the planes'."""
     count, held = int(bent.max(initial=FREE)) + 1, bent != FREE
-    num, mean, scatter = pool_points(table, bent, held, count)
+    num, mean, scatter = pool_points(table, bent, count)
     unit = np.zeros((count, 3))
     np.add.at(unit, bent[held], table.nodes.unit[held])
     edges = _edges_of(table.edges, held)

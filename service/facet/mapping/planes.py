@@ -46,7 +46,6 @@ class PlaneSet:
     """Planes over the nodes of a table; K planes in canonical order."""
 
     label: NDArray[np.int64]  # (T,) plane of each node, FREE: remainder
-    core: NDArray[np.bool_]  # (T,) it took part in the fit (not adopted in stage 4)
     nodes: Nodes  # (K, ...) statistics of the voxels
     occupation: NDArray[np.int64]  # (K,) voxels
     stages: Stages
@@ -77,11 +76,10 @@ def group_planes(
     roots, merged = merge_nodes(nodes, every, tight)
     into, nodes = _relabel(roots, merged)
     label = np.where(label == FREE, FREE, into[label]) if len(into) else label
-    core = label != FREE
     label = _adopt(table, label, nodes, limit)
     occupation = _occupation(label, table, len(nodes.votes))
     stages.final = len(nodes.votes)
-    return PlaneSet(label, core, nodes, occupation, stages)
+    return PlaneSet(label, nodes, occupation, stages)
 
 
 @kernel
@@ -233,12 +231,12 @@ class PointFit(NamedTuple):
 
 
 @kernel
-def _pool_points(points, corners, label, core, num, mean, scatter):  # type: ignore[no-untyped-def]
+def _pool_points(points, corners, label, num, mean, scatter):  # type: ignore[no-untyped-def]
     m, s = np.zeros(3), np.zeros(6)
     own_mean, own = np.zeros(3), np.zeros(6)
     for t in range(points.shape[0]):
         p = label[t]
-        if p < 0 or not core[t] or points[t, 0] == 0:
+        if p < 0 or points[t, 0] == 0:
             continue
         n = float(points[t, 0])
         i = 0
@@ -257,25 +255,25 @@ def _pool_points(points, corners, label, core, num, mean, scatter):  # type: ign
 
 
 def pool_points(
-    table: Table, label: NDArray[np.int64], core: NDArray[np.bool_], count: int
+    table: Table, label: NDArray[np.int64], count: int
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
     """Pool the exact point moments of the tile-planes of `count` things, in canonical order.
 
-    label: (T,) which thing, FREE: none; core: (T,) whether it counts. Returns number (K,), mean
+    label: (T,) which thing, FREE: none. Returns number (K,), mean
     (K, 3) and scatter (K, 6) about it, voxels."""
     num = np.zeros(count, np.int64)
     mean, scatter = np.zeros((count, 3)), np.zeros((count, 6))
     corners = (unpack_all(table.tile_keys) * float(TILE))[table.tile_of]
-    _pool_points(table.points, corners, label, core, num, mean, scatter)
+    _pool_points(table.points, corners, label, num, mean, scatter)
     return num, mean, scatter
 
 
 def fit_points(table: Table, planes: PlaneSet, voxel_m: float) -> PointFit:
-    """Pool the exact point moments of each plane's core tile-planes, in canonical order.
+    """Pool the exact point moments of each plane's tile-planes, in canonical order.
 
     A plane with hardly any pure points is fitted to its voxels' centroids instead."""
     count = len(planes.nodes.votes)
-    num, mean, scatter = pool_points(table, planes.label, planes.core, count)
+    num, mean, scatter = pool_points(table, planes.label, count)
     few = num < ENOUGH_POINTS
     mean[few], scatter[few] = planes.nodes.mean[few], planes.nodes.scatter[few]
     on = planes.label != FREE
