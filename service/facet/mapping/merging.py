@@ -39,7 +39,9 @@ class Limits(NamedTuple):
     edge_cos: float  # of the nodes at the ends of an edge
     cos: float
     offset: float
+    rms: float  # distance of the smaller one's voxels from the larger one's plane
     cross: float  # offset between planes that do not touch
+    reach: float  # of the larger one's extent towards the other: how far apart their middles may be
     variance: float
     bridge: float  # angle that a merged normal may leave its members' own, radians
     tilt: float  # and what noise adds to that angle: this, over the width
@@ -52,7 +54,9 @@ def limits(settings: MapSettings, sigma: float, angle_deg: float | None = None) 
         edge_cos=math.cos(math.radians(settings.edge_angle_deg)),
         cos=math.cos(math.radians(angle_deg or settings.merge_angle_deg)),
         offset=offset,
+        rms=offset,
         cross=min(settings.cross_sigmas * sigma, offset),
+        reach=math.inf,
         variance=settings.max_merged_sigma**2,
         bridge=math.radians(settings.bridge_angle_deg),
         tilt=settings.tilt_offset,
@@ -177,6 +181,19 @@ def _root(parent, t):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
+def _reaches(votes, mean, scatter, to, reach):  # type: ignore[no-untyped-def]
+    """Whether a place is so near to a node, against its extent that way, that its plane says
+    anything there."""
+    x, y, z, s = to[0] - mean[0], to[1] - mean[1], to[2] - mean[2], scatter
+    square = x * x + y * y + z * z
+    spread = (
+        s[0] * x * x + s[3] * y * y + s[5] * z * z
+        + 2.0 * (s[1] * x * y + s[2] * x * z + s[4] * y * z)
+    ) / votes  # fmt: skip
+    return square * square <= reach * reach * 12.0 * spread
+
+
+@kernel(allocates=False)
 def _try(votes, mean, scatter, unit, normals, narrow, a, b, limit, m, s, u):  # type: ignore[no-untyped-def]
     """Whether a and b (a the larger) are one plane; m, s, u are then its statistics, and what comes
     with it its normal and the variance across it."""
@@ -185,13 +202,15 @@ def _try(votes, mean, scatter, unit, normals, narrow, a, b, limit, m, s, u):  # 
     w = _offset(normals, mean, a, b)
     if abs(w) > limit.offset:
         return False, 0.0, 0.0, 0.0, 0.0
+    if not _reaches(votes[a], mean[a], scatter[a], mean[b], limit.reach):
+        return False, 0.0, 0.0, 0.0, 0.0
     n = normals[a]
     sb = scatter[b]
     spread = (
         sb[0] * n[0] * n[0] + sb[3] * n[1] * n[1] + sb[5] * n[2] * n[2]
         + 2.0 * (sb[1] * n[0] * n[1] + sb[2] * n[0] * n[2] + sb[4] * n[1] * n[2])
     ) / votes[b]  # fmt: skip
-    if spread + w * w > limit.offset * limit.offset:  # P4
+    if spread + w * w > limit.rms * limit.rms:  # P4
         return False, 0.0, 0.0, 0.0, 0.0
     total = pool(votes[a], mean[a], scatter[a], votes[b], mean[b], sb, m, s)
     u[0], u[1], u[2] = unit[a, 0] + unit[b, 0], unit[a, 1] + unit[b, 1], unit[a, 2] + unit[b, 2]

@@ -72,7 +72,9 @@ def group_planes(
     label, nodes = _drop(label, nodes, keep)
 
     every = _every_pair(len(nodes.votes))
-    tight = limit._replace(edge_cos=float(np.cos(limit.bridge)), offset=limit.cross)
+    tight = limit._replace(
+        edge_cos=float(np.cos(limit.bridge)), offset=limit.cross, reach=settings.cross_reach
+    )
     roots, merged = merge_nodes(nodes, every, tight)
     into, nodes = _relabel(roots, merged)
     label = np.where(label == FREE, FREE, into[label]) if len(into) else label

@@ -61,6 +61,7 @@ class MapSettings:
     bridge_angle_deg: float = 4.0  # phi_c: merged normal against the members' own
     tilt_offset: float = 0.25
     cross_sigmas: float = 1.0  # between planes that do not touch
+    cross_reach: float = 8.0  # extents of the larger one between their middles
     merge_sigmas: float = 3.0
     max_merged_sigma: float = 0.5
     min_area_m2: float = 0.25  # n_occ is never above this many square metres of voxels
