@@ -6,7 +6,7 @@ STAMP := $(VENV)/.installed
 PEERS := .venv-bench
 PEERS_STAMP := $(PEERS)/.installed
 PROTO := protocol/facet_protocol/proto
-NAME = paper truth real speed live core peers robots recorder ceiling
+NAME = paper truth shapes real speed live core peers robots recorder ceiling
 
 .PHONY: setup demo test format lint types unit bench figures soak proto recordings docker-check clean
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -92,23 +92,23 @@ def columns() -> Scene:
         level_rectangle("floor", *size, 0.0, looks_up=True),
         level_rectangle("ceiling", *size, 2.5, looks_up=False),
         *room_walls("room", *size, (0.0, 2.5), {}),
-        *_prism("column", (2.2, 2.5), 0.6, 24, planar=False),
-        *_prism("pillar", (4.8, 2.5), 0.5, 6, planar=True),
+        *prism("column", (2.2, 2.5), 0.6, 24, height=2.5, planar=False),
+        *prism("pillar", (4.8, 2.5), 0.5, 6, height=2.5, planar=True),
     ]
     waypoints = [(1, 1, 0), (6, 0.9, 0), (6.1, 4.0, 0), (0.9, 4.1, 0), (0.8, 1.6, 0)]
     drive = Drive(np.array(waypoints, np.float64))
     return Scene("columns", tuple(surfaces), drive).moved(12.0, (-1.3, 0.7, 0.2))
 
 
-def _prism(
-    name: str, centre: tuple[float, float], radius: float, faces: int, *, planar: bool
+def prism(
+    name: str, centre: Sequence[float], radius: float, faces: int, *, height: float, planar: bool
 ) -> list[TruthSurface]:
     """The faces of an upright prism, seen from outside."""
     angle = np.linspace(0.3, 0.3 + 2.0 * np.pi, faces + 1)
     ring = np.asarray(centre) + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
     corners = [(float(x), float(y)) for x, y in ring]
     return [
-        wall(f"{name} {i}", corners[i], corners[i + 1], (0.0, 2.5), planar=planar)
+        wall(f"{name} {i}", corners[i], corners[i + 1], (0.0, height), planar=planar)
         for i in range(faces)
     ]
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from facet.mapping.mapper import Mapper
 from facet.mapping.merging import limits
-from facet.mapping.planes import FREE, detail_level, group_planes
+from facet.mapping.planes import detail_level, group_planes
 from facet.mapping.settings import MapSettings
 from facet.mapping.table import tabulate
 from mapping_logs import log, mapped
@@ -100,5 +100,4 @@ def test_occupation_is_what_the_labels_say() -> None:
     assert (
         stages.seeds >= stages.merged >= stages.detailed >= stages.final == len(planes.occupation)
     )
-    assert np.all((planes.label != FREE) | ~planes.core)
     assert 0.98 - 1e-9 <= stages.detail_reached <= 1.0

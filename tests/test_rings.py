@@ -155,15 +155,15 @@ def test_rings_begin_at_their_smallest_vertex() -> None:
 
 def test_outward_moves_away_from_the_surface() -> None:
     ring = np.array(square(0, 0, 100), np.int64)
-    assert outward([ring])[0].tolist() == [[-2, -2], [102, -2], [102, 102], [-2, 102]]
+    assert outward(ring).tolist() == [[-2, -2], [102, -2], [102, 102], [-2, 102]]
     hole = ring[::-1]
-    assert sorted(outward([hole])[0].tolist()) == [[2, 2], [2, 98], [98, 2], [98, 98]]
-    assert signed_area(outward([hole])[0].astype(np.int64)) == -(96.0**2)
+    assert sorted(outward(hole).tolist()) == [[2, 2], [2, 98], [98, 2], [98, 98]]
+    assert signed_area(outward(hole).astype(np.int64)) == -(96.0**2)
 
 
 def test_outward_moves_no_vertex_far() -> None:
     for ring in stitch(tiled(scattered(5, 3000, SIZE, 100))):
-        (moved,) = outward([ring])
+        moved = outward(ring)
         gap = np.abs(moved[:, None, :] - ring[None, :, :]).max(axis=2).min(axis=1)
         assert gap.max() <= np.ceil(2.83 * OUTWARD) + 1
 
@@ -191,7 +191,7 @@ def test_outward_leaves_rings_without_pinched_vertices_simple() -> None:
     for seed in range(20):
         for ring in stitch(tiled(scattered(seed, 150 + 40 * (seed % 5), SIZE))):
             if len(np.unique(ring, axis=0)) == len(ring):
-                assert len(crossings(outward([ring])[0])) == 0
+                assert len(crossings(outward(ring))) == 0
 
 
 def test_crossings_finds_a_bow_tie_and_allows_a_touch() -> None:

@@ -46,7 +46,7 @@ HALO = np.dtype(  # scratch of one thread: the surroundings of one block at a ti
 
 
 def make_halos(count: int) -> NDArray[np.void]:
-    """(count,) HALO: 2.2 MB each, of which only what is used gets memory."""
+    """(count,) HALO: 2.3 MB each, of which only what is used gets memory."""
     return sparse(count, HALO)
 
 
@@ -201,16 +201,23 @@ def _spread(words, places, count, votes):  # type: ignore[no-untyped-def]
         votes[i] = x | (y << IN_Y) | (z << IN_Z) | ((word >> 16) << IN_VIEW)
 
 
+@kernel(allocates=False, inlined=True)
+def rows_within(halo, margin, x, y, r):  # type: ignore[no-untyped-def]
+    """Where a cube round a voxel x, y of the block lies at each z: rows a z has, the first of its
+    rows, its first bit in a row, as many ones as it is wide, and ones for the bits before it."""
+    if halo.along_y[0] != 0:
+        x, y = y, x
+    low = np.uint64(x + margin - r)
+    cube = (np.uint64(1) << np.uint64(2 * r + 1)) - np.uint64(1)
+    before = (np.uint64(1) << low) - np.uint64(1)
+    return BLOCK + 2 * margin, y + margin - r, low, cube, before
+
+
 @kernel(allocates=False)
 def take(halo, margin, x, y, z, r):  # type: ignore[no-untyped-def]
     """Copy the votes within r (Chebyshev, at most `margin`) of the voxel x, y, z of the block, at
     most MOST, to halo.taken. Returns how many; what lies behind them means nothing."""
-    edge = BLOCK + 2 * margin
-    if halo.along_y[0] != 0:
-        x, y = y, x
-    low, first_y = np.uint64(x + margin - r), y + margin - r
-    cube = (np.uint64(1) << np.uint64(2 * r + 1)) - np.uint64(1)
-    before = (np.uint64(1) << low) - np.uint64(1)
+    edge, first_y, low, cube, before = rows_within(halo, margin, x, y, r)
     count = 0
     for k in range(z + margin - r, z + margin + r + 1):
         filled = (halo.filled[k] >> np.uint64(first_y)) & cube

@@ -49,10 +49,11 @@ def _constant(value: int) -> Any:
     return ir.Constant(_I16, [value] * LANES)
 
 
-def _spread(context: Any, builder: Any, number: Any, kind: Any) -> Any:
-    """A number in all lanes."""
-    one = context.cast(builder, number, kind, types.int16)
-    first = builder.insert_element(_constant(0), one, ir.Constant(ir.IntType(32), 0))
+def _spread(context: Any, builder: Any, number: Any, kind: Any, lane: Any = types.int16) -> Any:
+    """A number in all lanes, of the type of one."""
+    one = context.cast(builder, number, kind, lane)
+    nothing = ir.Constant(ir.VectorType(ir.IntType(lane.bitwidth), LANES), [0] * LANES)
+    first = builder.insert_element(nothing, one, ir.Constant(ir.IntType(32), 0))
     return builder.shuffle_vector(first, first, ir.Constant(_I32, [0] * LANES))
 
 
@@ -132,11 +133,7 @@ def _load_part(typingctx: Any, column: Any, at: Any, low: Any) -> Any:
 
     def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
         wide = builder.load(_address(context, builder, signature.args, args, _I64), align=8)
-        one = context.cast(builder, args[2], signature.args[2], types.int64)
-        first = builder.insert_element(
-            ir.Constant(_I64, [0] * LANES), one, ir.Constant(ir.IntType(32), 0)
-        )
-        shift = builder.shuffle_vector(first, first, ir.Constant(_I32, [0] * LANES))
+        shift = _spread(context, builder, args[2], signature.args[2], types.int64)
         return builder.trunc(builder.lshr(wide, shift), _I16)
 
     return _LANES(column, at, low), codegen

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from facet.mapping.bits import population
-from facet.mapping.halo import IN_VIEW, IN_X, IN_Y, IN_Z, WEIGHT_IN_X
+from facet.mapping.halo import IN_VIEW, IN_X, IN_Y, IN_Z, WEIGHT_IN_X, rows_within
 from facet.mapping.kernel import kernel
 from facet.mapping.lanes import (
     LANES,
@@ -23,7 +23,6 @@ from facet.mapping.lanes import (
     store,
     total,
 )
-from facet.mapping.settings import BLOCK
 
 FACED = 9  # columns of votes as a voxel sees them: centroids from its corner, 1/8 voxels; weights;
 # views; -1 where these are of its side, else 0; how far it is to their voxels (Chebyshev)
@@ -78,12 +77,8 @@ def is_beside(seen, word):  # type: ignore[no-untyped-def]
 def is_one_pose(halo, margin, x, y, z, r, seen):  # type: ignore[no-untyped-def]
     """Whether all votes within r (at most `margin`) of the voxel x, y, z of the block, and of its
     side, come from one known line-scan pose. seen: its observable. The first few mostly tell."""
-    edge, known = BLOCK + 2 * margin, np.int32(0)
-    if halo.along_y[0] != 0:
-        x, y = y, x
-    low, first_y = np.uint64(x + margin - r), y + margin - r
-    cube = (np.uint64(1) << np.uint64(2 * r + 1)) - np.uint64(1)
-    before = (np.uint64(1) << low) - np.uint64(1)
+    edge, first_y, low, cube, before = rows_within(halo, margin, x, y, r)
+    known = np.int32(0)
     for k in range(z + margin - r, z + margin + r + 1):
         for line in range(k * edge + first_y, k * edge + first_y + 2 * r + 1):
             row = halo.rows[line]

@@ -9,7 +9,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from facet.mapping.kernel import kernel
-from facet.mapping.runs import starts_of
 
 OUTWARD = 2.0  # grid units (1/8 voxel): a border centroid sits inside its voxel
 ROW = 24  # grid units: points so near to one another are of one row of voxels
@@ -166,27 +165,55 @@ def _turn(path, vertex, edges, num):  # type: ignore[no-untyped-def]
     return num + path.shape[0]
 
 
+@kernel
+def _in_order(edges):  # type: ignore[no-untyped-def]
+    """Edges (E, 4) by where they start, then by where they stop, each once."""
+    start, stop = _keys(edges)
+    order = np.argsort(stop, kind="mergesort")
+    order = order[np.argsort(start[order], kind="mergesort")]
+    kept, count = np.empty(order.shape[0], np.int64), 0
+    for e in order:
+        last = kept[count - 1] if count else e
+        if count == 0 or start[e] != start[last] or stop[e] != stop[last]:
+            kept[count] = e
+            count += 1
+    return edges[kept[:count]]
+
+
+@kernel
+def _stitch(edges):  # type: ignore[no-untyped-def]
+    """Vertices (M, 2) of the rings of edges (E, 4), and where each stops (R,): see `stitch`."""
+    edges = _in_order(edges)
+    start, stop = _keys(edges)
+    edges = edges[_single(start, stop, edges, ROW)]
+    start, stop = _keys(edges)
+    vertex, number = np.empty(start.shape[0], np.int64), np.int64(0)
+    for e in range(start.shape[0]):
+        number += e > 0 and start[e] > start[e - 1]
+        vertex[e] = number
+    chained, ends = _chains(_successors(start, stop, edges))
+    chained, ends = _split(chained, ends, vertex)
+    begins = np.empty(ends.shape[0], np.int64)
+    for r in range(ends.shape[0]):
+        begins[r] = ends[r - 1] if r else 0
+    order = np.argsort(vertex[chained[begins]], kind="mergesort")
+    vertices, stops = np.empty((chained.shape[0], 2), np.int64), np.empty_like(ends)
+    count = 0
+    for r in range(order.shape[0]):
+        for n in range(begins[order[r]], ends[order[r]]):
+            vertices[count] = edges[chained[n], :2]
+            count += 1
+        stops[r] = count
+    return vertices, stops
+
+
 def stitch(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     """Closed rings (M, 2) of directed edges (E, 4), each from its smallest vertex, in order of it.
 
     An edge that is there both ways has no area at either side. A row of voxels is such a strip: the
     threshold that closes a door. Others are left out."""
-    if not len(edges):
-        return []
-    start, stop = _keys(edges)
-    order = np.lexsort((stop, start))
-    start, stop = start[order], stop[order]
-    new = np.concatenate([[True], (start[1:] != start[:-1]) | (stop[1:] != stop[:-1])])
-    order, start, stop = order[new], start[new], stop[new]
-    single = _single(start, stop, edges[order], ROW)
-    edges, start, stop = edges[order[single]], start[single], stop[single]
-    chained, ends = _chains(_successors(start, stop, edges))
-    vertex = np.cumsum(np.diff(start, prepend=start[:1]) > 0)
-    chained, ends = _split(chained, ends, vertex)
-    vertices, begins = edges[chained, :2], starts_of(np.diff(ends, prepend=0))
-    rings = [vertices[a:b] for a, b in zip(begins.tolist(), ends.tolist(), strict=False)]
-    by_first = np.argsort(vertex[chained[begins[:-1]]], kind="stable").tolist()
-    return [rings[n] for n in by_first]
+    vertices, stops = _stitch(edges)
+    return [vertices[a:b] for a, b in itertools.pairwise([0, *stops.tolist()])]
 
 
 def signed_area(ring: NDArray[np.int64] | NDArray[np.int32]) -> float:
@@ -219,57 +246,104 @@ def inside(ring, u, v):  # type: ignore[no-untyped-def]
     return odd
 
 
+@kernel
+def _owners(vertices, stops, least_area):  # type: ignore[no-untyped-def]
+    """(R,) the outer ring of at least `least_area` that each ring lies in, or is; -1: none."""
+    count, begin = stops.shape[0], np.int64(0)
+    areas, owner = np.empty(count), np.full(count, -1, np.int64)
+    for r in range(count):
+        areas[r] = _shoelace(vertices[begin : stops[r]]) / 2.0
+        begin = stops[r]
+    by_size = np.argsort(areas, kind="mergesort")
+    outers = by_size[areas[by_size] >= least_area]
+    begin = np.int64(0)
+    for r in range(count):
+        if areas[r] >= least_area:
+            owner[r] = r
+        elif areas[r] < 0.0:
+            u0, v0 = float(vertices[begin, 0]), float(vertices[begin, 1])
+            u1, v1 = float(vertices[begin + 1, 0]), float(vertices[begin + 1, 1])
+            length = np.sqrt((u1 - u0) * (u1 - u0) + (v1 - v0) * (v1 - v0))
+            u = (u0 + u1) / 2 + 0.05 * (v1 - v0) / length  # just right of an edge: in the hole
+            v = (v0 + v1) / 2 - 0.05 * (u1 - u0) / length
+            for o in outers:
+                if inside(vertices[(stops[o - 1] if o else 0) : stops[o]], u, v):
+                    owner[r] = o
+                    break
+        begin = stops[r]
+    whole = np.zeros(count)
+    for r in range(count):
+        if owner[r] >= 0:
+            whole[owner[r]] += areas[r]
+    for r in range(count):
+        if owner[r] >= 0 and whole[owner[r]] < least_area:  # a row of voxels round nothing
+            owner[r] = -1
+    return owner
+
+
+@kernel
+def outward(ring):  # type: ignore[no-untyped-def]
+    """A ring (M, 2) with each vertex moved by OUTWARD away from the surface, along the mean of its
+    edges' normals, int32."""
+    count = ring.shape[0]
+    right, moved = np.empty((count, 2)), np.empty((count, 2), np.int32)
+    for m in range(count):
+        n = m + 1 if m + 1 < count else 0
+        u, v = float(ring[n, 0] - ring[m, 0]), float(ring[n, 1] - ring[m, 1])
+        length = np.sqrt(u * u + v * v)
+        right[m, 0], right[m, 1] = v / length, -u / length  # the surface is on the left
+    for m in range(count):
+        u, v = right[m, 0] + right[m - 1, 0], right[m, 1] + right[m - 1, 1]
+        far = 2.0 * OUTWARD / max(u * u + v * v, 0.5)  # a miter of at most 2.8
+        moved[m, 0] = np.int32(np.floor(ring[m, 0] + far * u + 0.5))
+        moved[m, 1] = np.int32(np.floor(ring[m, 1] + far * v + 0.5))
+    out, kept = np.empty_like(moved), 0
+    for m in range(count):
+        if moved[m, 0] != moved[m - 1, 0] or moved[m, 1] != moved[m - 1, 1]:
+            out[kept] = moved[m]
+            kept += 1
+    return out[:kept] if kept > 2 else moved
+
+
+@kernel
+def _outline(edges, least_area):  # type: ignore[no-untyped-def]
+    """Rings of the surfaces that edges (E, 4) bound, moved outward: an outer ring, then its holes.
+
+    Returns vertices (M, 2), where each ring stops (R,), and their signed areas (R,)."""
+    vertices, stops = _stitch(edges)
+    owner = _owners(vertices, stops, least_area)
+    out = np.empty((vertices.shape[0], 2), np.int32)
+    ends, areas = np.empty(stops.shape[0], np.int64), np.empty(stops.shape[0])
+    num, rings = 0, 0
+    for o in range(stops.shape[0]):
+        if owner[o] != o:
+            continue
+        for r in range(-1, stops.shape[0]):
+            n = o if r < 0 else r  # the outer ring first
+            if owner[n] != o or r == o:
+                continue
+            ring = outward(vertices[(stops[n - 1] if n else 0) : stops[n]])
+            area = _shoelace(ring) / 2.0
+            if r >= 0 and area >= 0.0:  # a hole that closed
+                continue
+            out[num : num + ring.shape[0]] = ring
+            num += ring.shape[0]
+            ends[rings], areas[rings] = num, area
+            rings += 1
+    return out[:num].copy(), ends[:rings], areas[:rings]
+
+
 def surfaces_of(edges: NDArray[np.int64], least_area: float) -> list[Outline]:
     """Outlines of at least `least_area` (1/8 voxel)^2 from boundary edges (E, 4)."""
-    rings = stitch(edges)
-    areas = [signed_area(r) for r in rings]
-    outers = [(r, a) for r, a in zip(rings, areas, strict=True) if a >= least_area]
-    holes: list[list[NDArray[np.int64]]] = [[] for _ in outers]
-    by_size = sorted(range(len(outers)), key=lambda i: (outers[i][1], i))
-    for ring, area in zip(rings, areas, strict=True):
+    vertices, ends, areas = _outline(edges, least_area)
+    outlines: list[Outline] = []
+    for (begin, end), area in zip(
+        itertools.pairwise([0, *ends.tolist()]), areas.tolist(), strict=True
+    ):
+        ring = vertices[begin:end]
         if area >= 0.0:
-            continue
-        (u0, v0), (u1, v1) = ring[0].astype(float), ring[1].astype(float)
-        length = float(np.hypot(u1 - u0, v1 - v0))
-        u = (u0 + u1) / 2 + 0.05 * (v1 - v0) / length  # just right of an edge: in the hole
-        v = (v0 + v1) / 2 - 0.05 * (u1 - u0) / length
-        for i in by_size:
-            if inside(outers[i][0], u, v):
-                holes[i].append(ring)
-                break
-    whole = [
-        (outer, own)
-        for (outer, area), own in zip(outers, holes, strict=True)
-        if area + sum(signed_area(hole) for hole in own) >= least_area
-    ]  # without rows of voxels round nothing
-    moved = iter(outward([ring for outer, own in whole for ring in (outer, *own)]))
-    outlines = []
-    for _, own in whole:
-        grown, *others = itertools.islice(moved, 1 + len(own))
-        sizes = [signed_area(hole) for hole in others]
-        shrunk = [hole for hole, size in zip(others, sizes, strict=True) if size < 0.0]
-        area = signed_area(grown) + float(sum(size for size in sizes if size < 0.0))
-        outlines.append(Outline(grown, shrunk, area))
+            outlines.append(Outline(ring, [], area))
+        else:
+            last = outlines[-1]
+            outlines[-1] = Outline(last.outer, [*last.holes, ring], last.area + area)
     return outlines
-
-
-def outward(rings: list[NDArray[np.int64]]) -> list[NDArray[np.int32]]:
-    """Each vertex moved by OUTWARD away from the surface, along the mean of its edges' normals."""
-    if not rings:
-        return []
-    starts = starts_of([len(ring) for ring in rings])
-    firsts, lasts = starts[:-1], starts[1:] - 1
-    after, before = np.arange(1, starts[-1] + 1), np.arange(-1, starts[-1] - 1)
-    after[lasts], before[firsts] = firsts, lasts
-    p = np.concatenate(rings).astype(np.float64)
-    step = p[after] - p
-    step /= np.hypot(step[:, 0], step[:, 1])[:, None]
-    right = np.stack([step[:, 1], -step[:, 0]], axis=1)  # the surface is on the left
-    mean = right + right[before]
-    norm2 = np.maximum(np.sum(mean * mean, axis=1), 0.5)  # a miter of at most 2.8
-    moved = np.floor(p + OUTWARD * 2.0 * mean / norm2[:, None] + 0.5).astype(np.int32)
-    keep = np.any(moved != moved[before], axis=1)
-    keep |= np.repeat(np.add.reduceat(keep, firsts, dtype=np.int64) <= 2, np.diff(starts))
-    kept = starts_of(keep)[starts].tolist()
-    moved = moved[keep]
-    return [moved[a:b].copy() for a, b in itertools.pairwise(kept)]
