@@ -268,7 +268,7 @@ class Bends:
         strips = flat & (widths < self._settings.strip_width)
         origin = np.floor(nodes.mean * STEPS).astype(np.int64)
         turns = _turns(self._sums(table, label, strips, origin), self._settings.n_min)
-        flat &= ~_bent(_pairs(table, label, strips), nodes, spans, turns)
+        flat &= ~_bent(_pairs(table.edges, label, strips), nodes, spans, turns)
         numbers = np.full(len(flat) + 1, FREE)  # FREE finds the last one
         bent = np.flatnonzero(strips & ~flat)
         numbers[bent] = np.arange(len(bent))
@@ -339,10 +339,14 @@ def _nodes_of(label: NDArray[np.int64], asked: NDArray[np.bool_]) -> NDArray[np.
     return held[asked[label[held]]]
 
 
-def _pairs(table: Table, label: NDArray[np.int64], asked: NDArray[np.bool_]) -> NDArray[np.int64]:
-    """(E, 2) planes that touch, of those that are asked for (K,), ascending."""
-    numbers = np.append(np.where(asked, np.arange(len(asked)), FREE), FREE)  # FREE finds the last
-    first, second = numbers[label[table.edges.T]]
-    on = (first != FREE) & (second != FREE) & (first != second)
-    low, high = np.minimum(first, second)[on], np.maximum(first, second)[on]
-    return np.stack(np.divmod(np.unique(low << 32 | high), 1 << 32), axis=1)
+@kernel
+def _pairs(edges, label, asked):  # type: ignore[no-untyped-def]
+    """(E, 2) planes that touch, of those that are asked for (K,): once for each edge (T, 2) of
+    their tile-planes, label (T,)."""
+    out, count = np.empty(edges.shape, np.int64), 0
+    for e in range(edges.shape[0]):
+        p, q = label[edges[e, 0]], label[edges[e, 1]]
+        if p >= 0 and q >= 0 and p != q and asked[p] and asked[q]:
+            out[count, 0], out[count, 1] = p, q
+            count += 1
+    return out[:count]
