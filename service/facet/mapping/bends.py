@@ -267,8 +267,11 @@ class Bends:
         flat = widths >= self._settings.min_width
         strips = flat & (widths < self._settings.strip_width)
         origin = np.floor(nodes.mean * STEPS).astype(np.int64)
-        turns = _turns(self._sums(table, label, strips, origin), self._settings.n_min)
-        flat &= ~_bent(_pairs(table.edges, label, strips), nodes, spans, turns)
+        pairs = _pairs(table.edges, label, strips)
+        asked = np.zeros_like(strips)
+        asked[pairs.ravel()] = True
+        turns = _turns(self._sums(table, label, asked, origin), self._settings.n_min)
+        flat &= ~_bent(pairs, nodes, spans, turns)
         numbers = np.full(len(flat) + 1, FREE)  # FREE finds the last one
         bent = np.flatnonzero(strips & ~flat)
         numbers[bent] = np.arange(len(bent))
