@@ -202,7 +202,7 @@ def _try(votes, mean, scatter, unit, normals, narrow, a, b, limit, m, s, u):  # 
     w = _offset(normals, mean, a, b)
     if abs(w) > limit.offset:
         return False, 0.0, 0.0, 0.0, 0.0
-    if not _reaches(votes[a], mean[a], scatter[a], mean[b], limit.reach):
+    if limit.reach < np.inf and not _reaches(votes[a], mean[a], scatter[a], mean[b], limit.reach):
         return False, 0.0, 0.0, 0.0, 0.0
     n = normals[a]
     sb = scatter[b]
