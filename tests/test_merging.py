@@ -186,6 +186,29 @@ def test_what_is_one_plane_and_what_is_not() -> None:
     assert pair((0.0, 9.0, 0.0), (1.0, 0.5, 0.0)) == 2  # at an angle
 
 
+def test_across_a_gap_places_count_not_noise_and_only_so_far() -> None:
+    """As planes that do not touch are compared: with less offset, and as far as one reaches."""
+    tight = LIMIT._replace(offset=0.1, reach=8.0)
+    rng = np.random.default_rng(3)
+    up = np.array([0.0, 0.0, 1.0])
+    edge = np.array([[0, 1]])
+    for away, offset, one in ((30.0, 0.0, True), (30.0, 0.4, False), (90.0, 0.0, False)):
+        here = sheet(rng, np.zeros(3), up, 400)
+        there = sheet(rng, np.array([away, 0.0, offset]), up, 200)
+        there -= up * (there[:, 2].mean() - here[:, 2].mean() - offset)
+        assert there[:, 2].std() > tight.offset  # it scatters by more than it may be off
+        roots, _ = merge_nodes(nodes_of([(here, up), (there, up)]), edge, tight)
+        assert (roots[0] == roots[1]) == one
+
+
+def test_what_touches_is_asked_no_reach() -> None:
+    """A node of one voxel has no extent at all."""
+    up = np.array([0.0, 0.0, 1.0])
+    sheets = [(np.zeros((1, 3)), up), (np.array([[1.0, 0.0, 0.0]]), up)]
+    roots, _ = merge_nodes(nodes_of(sheets), np.array([[0, 1]]), LIMIT)
+    assert roots.tolist() == [0, 0]
+
+
 def test_far_from_the_origin_nothing_is_different() -> None:
     """Offsets d are never compared: they depend on where the origin is."""
     nodes, edges, _ = scene(1)
