@@ -53,6 +53,14 @@ def test_strips_that_turn_as_they_stand_to_one_another_are_bent() -> None:
     assert bent(round_column(20.0), [20.0] * 4) == [True] * 4
 
 
+def test_beside_a_bent_strip_less_of_a_turn_is_asked_for() -> None:
+    """At its end a curved wall goes over into a plane one, and turns by a part of the angle."""
+    column = round_column(20.0)
+    assert bent(column, [7.0] * 4) == [False] * 4
+    assert bent(column, [7.0, 7.0, 20.0, 7.0]) == [True] * 4
+    assert bent(column, [7.0, 0.0, 20.0, 7.0]) == [False, False, True, True]
+
+
 def test_faces_of_a_pillar_are_not_though_points_of_others_turn_their_rims() -> None:
     assert bent(round_column(60.0), [13.0] * 4) == [False] * 4
 

@@ -32,6 +32,7 @@ SUMS = 22  # n; sum x (3), xx (6); sum u (3), u x (9): x in 1/8 voxels, u normal
 UNKNOWN = -1
 ACROSS = 5  # n; sum s, ss, sss, ssss: 1/8 voxels across a strip
 STEADY = 0.4  # of the angle to the next strip: by so much at least the normals in a strip turn
+DRAWN = 0.25  # likewise where the next one is bent
 APART = 0.15  # chord of an angle: two strips that stand at a smaller one are one, split by noise
 PARALLEL = 0.95  # cosine: of the line between two strips and the length of one
 BESIDE = 0.3  # of the longer one's length: by so much at most two strips are shifted along it
@@ -109,7 +110,7 @@ def _copy_sums(old, old_starts, place, starts, sums):  # type: ignore[no-untyped
 
 
 @kernel(allocates=False)
-def _add_places(store, patches, rows, plane_of, origin, spans, sums):  # type: ignore[no-untyped-def]
+def _add_places(store, patches, rows, plane_of, origin, across, sums):  # type: ignore[no-untyped-def]
     """Likewise add to sums (K, ACROSS) where members with a normal are across the strip."""
     blocks, columns = store
     for m in range(rows.shape[0]):
@@ -118,8 +119,8 @@ def _add_places(store, patches, rows, plane_of, origin, spans, sums):  # type: i
             continue
         x, y, z = centroid(blocks, columns, row)
         x, y, z = x - origin[k, 0], y - origin[k, 1], z - origin[k, 2]
-        across = spans[k]
-        s = np.int64(np.floor(across[2] * x + across[3] * y + across[4] * z + 0.5))
+        to = across[k]
+        s = np.int64(np.floor(to[0] * x + to[1] * y + to[2] * z + 0.5))
         ss = s * s
         sums[k, 0] += 1
         sums[k, 1] += s
@@ -136,21 +137,29 @@ class Kept(NamedTuple):
     sums: NDArray[np.int64]  # (T, SUMS), UNKNOWN where nobody asked
 
 
+class Spans(NamedTuple):
+    """How far K planes reach."""
+
+    width: NDArray[np.float64]  # (K,) voxels
+    length: NDArray[np.float64]  # (K,) voxels
+    across: NDArray[np.float64]  # (K, 3) unit, along the width
+    along: NDArray[np.float64]  # (K, 3) unit, along the length
+
+
 @kernel
 def _spans(votes, scatter):  # type: ignore[no-untyped-def]
-    """(K, 8) width and length of planes, voxels, and unit vectors across and along them."""
-    out = np.zeros((votes.shape[0], 8))
-    for k in range(votes.shape[0]):
+    """Spans of planes."""
+    count = votes.shape[0]
+    width, length = np.empty(count), np.empty(count)
+    across, along = np.empty((count, 3)), np.empty((count, 3))
+    for k in range(count):
         a, b, c, d, e, f = scatter[k]
         _, _, _, _, middle, largest = smallest(scatter[k])
-        out[k, 0] = np.sqrt(12.0 * max(0.0, middle) / votes[k])
-        out[k, 1] = np.sqrt(12.0 * max(0.0, largest) / votes[k])
-        across, along = (
-            eigenvector(a, d, f, b, c, e, middle), eigenvector(a, d, f, b, c, e, largest)
-        )  # fmt: skip
-        for i in range(3):
-            out[k, 2 + i], out[k, 5 + i] = across[i], along[i]
-    return out
+        width[k] = np.sqrt(12.0 * max(0.0, middle) / votes[k])
+        length[k] = np.sqrt(12.0 * max(0.0, largest) / votes[k])
+        across[k, 0], across[k, 1], across[k, 2] = eigenvector(a, d, f, b, c, e, middle)
+        along[k, 0], along[k, 1], along[k, 2] = eigenvector(a, d, f, b, c, e, largest)
+    return Spans(width, length, across, along)
 
 
 @kernel
@@ -185,17 +194,18 @@ def _turns(sums, least):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _goes_on(nodes, spans, turn, p, q):  # type: ignore[no-untyped-def]
-    """Whether a strip p, whose normals turn by `turn`, goes on in a strip q, turning."""
-    u, v, d, own = nodes.unit[p], nodes.unit[q], nodes.mean, spans[p]
+def _goes_on(nodes, spans, turn, p, q, share):  # type: ignore[no-untyped-def]
+    """Whether a strip p, whose normals turn by `turn`, goes on in a strip q, turning by that share
+    of the angle between them."""
+    u, v, d, along = nodes.unit[p], nodes.unit[q], nodes.mean, spans.along[p]
     a = np.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
     b = np.sqrt(v[0] * v[0] + v[1] * v[1] + v[2] * v[2])
     x, y, z = v[0] / b - u[0] / a, v[1] / b - u[1] / a, v[2] / b - u[2] / a
     i, j, k = u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]
     dx, dy, dz = d[q, 0] - d[p, 0], d[q, 1] - d[p, 1], d[q, 2] - d[p, 2]
     chord = np.sqrt(x * x + y * y + z * z)
-    shifted = abs(dx * own[5] + dy * own[6] + dz * own[7])
-    is_parallel = abs(i * own[5] + j * own[6] + k * own[7]) >= PARALLEL * np.sqrt(
+    shifted = abs(dx * along[0] + dy * along[1] + dz * along[2])
+    is_parallel = abs(i * along[0] + j * along[1] + k * along[2]) >= PARALLEL * np.sqrt(
         i * i + j * j + k * k
     )
     bulges = x * dx + y * dy + z * dz > 0.0
@@ -203,19 +213,25 @@ def _goes_on(nodes, spans, turn, p, q):  # type: ignore[no-untyped-def]
         nodes.votes[q] >= ALIKE * nodes.votes[p]
         and chord >= APART
         and is_parallel
-        and shifted <= BESIDE * max(own[1], spans[q, 1])
-        and (turn if bulges else -turn) >= STEADY * chord
+        and shifted <= BESIDE * max(spans.length[p], spans.length[q])
+        and (turn if bulges else -turn) >= share * chord
     )
 
 
 @kernel
 def _bent(pairs, nodes, spans, turns):  # type: ignore[no-untyped-def]
-    """(K,) whether a strip goes on in one of those that it makes up pairs (E, 2) with, turning."""
+    """(K,) whether a strip goes on in one of those that it makes up pairs (E, 2) with, turning.
+    Less of a turn is asked for beside one that is bent."""
     out = np.zeros(turns.shape[0], np.bool_)
-    for e in range(pairs.shape[0]):
-        p, q = pairs[e, 0], pairs[e, 1]
-        out[p] |= _goes_on(nodes, spans, turns[p], p, q)
-        out[q] |= _goes_on(nodes, spans, turns[q], q, p)
+    grows = True
+    while grows:
+        grows = False
+        for e in range(pairs.shape[0]):
+            for a in range(2):
+                p, q = pairs[e, a], pairs[e, 1 - a]
+                share = DRAWN if out[q] else STEADY
+                if not out[p] and _goes_on(nodes, spans, turns[p], p, q, share):
+                    out[p] = grows = True
     return out
 
 
@@ -263,9 +279,8 @@ class Bends:
 
         label: (T,) plane of each tile-plane of the table; nodes, occupation: of the K planes."""
         spans = _spans(nodes.votes, nodes.scatter)
-        widths, lengths = spans[:, 0], spans[:, 1]
-        flat = widths >= self._settings.min_width
-        strips = flat & (widths < self._settings.strip_width)
+        flat = spans.width >= self._settings.min_width
+        strips = flat & (spans.width < self._settings.strip_width)
         origin = np.floor(nodes.mean * STEPS).astype(np.int64)
         pairs = _pairs(table.edges, label, strips)
         asked = np.zeros_like(strips)
@@ -276,15 +291,16 @@ class Bends:
         bent = np.flatnonzero(strips & ~flat)
         numbers[bent] = np.arange(len(bent))
         self.bent = numbers[label]
-        hollow = occupation < FULL * widths * lengths
-        thin = strips & flat & (widths >= GAP_WIDTH) & hollow
-        across = np.zeros((len(flat), ACROSS), np.int64)
+        hollow = occupation < FULL * spans.width * spans.length
+        thin = strips & flat & (spans.width >= GAP_WIDTH) & hollow
+        sums = np.zeros((len(flat), ACROSS), np.int64)
         own = _nodes_of(label, thin)
         rows, sizes = self._members(table, own)
         store, _, patches = self._voxels
-        _add_places(store, patches, rows, np.repeat(label[own], sizes), origin, spans, across)
+        plane_of = np.repeat(label[own], sizes)
+        _add_places(store, patches, rows, plane_of, origin, spans.across, sums)
         for plane in np.flatnonzero(thin).tolist():
-            flat[plane] = _bimodality(across[plane]) < EMPTY
+            flat[plane] = _bimodality(sums[plane]) < EMPTY
         return np.asarray(flat)
 
     def _sums(

@@ -216,11 +216,6 @@ def stitch(edges: NDArray[np.int64]) -> list[NDArray[np.int64]]:
     return [vertices[a:b] for a, b in itertools.pairwise([0, *stops.tolist()])]
 
 
-def signed_area(ring: NDArray[np.int64] | NDArray[np.int32]) -> float:
-    """Shoelace, positive counter-clockwise."""
-    return float(_shoelace(ring)) / 2.0
-
-
 @kernel(allocates=False)
 def _shoelace(ring):  # type: ignore[no-untyped-def]
     """Twice the signed area of a ring (M, 2)."""
@@ -314,22 +309,19 @@ def _outline(edges, least_area):  # type: ignore[no-untyped-def]
     owner = _owners(vertices, stops, least_area)
     out = np.empty((vertices.shape[0], 2), np.int32)
     ends, areas = np.empty(stops.shape[0], np.int64), np.empty(stops.shape[0])
+    places = np.arange(stops.shape[0])
     num, rings = 0, 0
-    for o in range(stops.shape[0]):
-        if owner[o] != o:
+    for n in np.argsort(2 * owner + (owner != places), kind="mergesort"):
+        if owner[n] < 0:
             continue
-        for r in range(-1, stops.shape[0]):
-            n = o if r < 0 else r  # the outer ring first
-            if owner[n] != o or r == o:
-                continue
-            ring = outward(vertices[(stops[n - 1] if n else 0) : stops[n]])
-            area = _shoelace(ring) / 2.0
-            if r >= 0 and area >= 0.0:  # a hole that closed
-                continue
-            out[num : num + ring.shape[0]] = ring
-            num += ring.shape[0]
-            ends[rings], areas[rings] = num, area
-            rings += 1
+        ring = outward(vertices[(stops[n - 1] if n else 0) : stops[n]])
+        area = _shoelace(ring) / 2.0
+        if owner[n] != n and area >= 0.0:  # a hole that closed
+            continue
+        out[num : num + ring.shape[0]] = ring
+        num += ring.shape[0]
+        ends[rings], areas[rings] = num, area
+        rings += 1
     return out[:num].copy(), ends[:rings], areas[:rings]
 
 
