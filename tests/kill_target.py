@@ -1,4 +1,5 @@
-"""A service to be killed: it says on its standard output what it has acknowledged, and no more."""
+"""A service to be killed: it says on its standard output what it has acknowledged, and no more. Of
+junk it says nothing: who listens would be busy with that."""
 
 from __future__ import annotations
 
@@ -14,6 +15,7 @@ from facet.mapping.settings import MapSettings
 from facet.resume import resume
 from facet.service import Service
 from facet.session import open_session, service_settings
+from facet.warmup import warm_up
 from facet_protocol.messages import Envelope
 
 SETTINGS = MapSettings(voxel_m=0.1)
@@ -36,15 +38,18 @@ def config_of(
     return load_config(None, overrides)
 
 
-def main(folder: Path, endpoint: str, checkpoint_s: float) -> None:
+def main(folder: Path, endpoint: str, checkpoint_s: float, is_warm: bool) -> None:
     config = config_of(folder, endpoint, checkpoint_s)
+    if is_warm:  # as `facet run` is
+        warm_up(SETTINGS)
     resumed = resume(config, Mapper(SETTINGS))
     with open_session(service_settings(config.network)) as session:
         service = Service(session, config, resumed.mapper, resumed)
         put = service._durable.put
 
         def tell(envelopes: list[Envelope], end: Any = None) -> None:
-            lines = [f"{e.key} {e.epoch} {e.sequence}\n" for e in envelopes]
+            heard = (e for e in envelopes if "/robot/junk/" not in e.key)
+            lines = [f"{e.key} {e.epoch} {e.sequence}\n" for e in heard]
             os.write(1, "".join(lines).encode())
             put(envelopes, end)
 
@@ -55,4 +60,4 @@ def main(folder: Path, endpoint: str, checkpoint_s: float) -> None:
 
 
 if __name__ == "__main__":
-    main(Path(sys.argv[1]), sys.argv[2], float(sys.argv[3]))
+    main(Path(sys.argv[1]), sys.argv[2], float(sys.argv[3]), sys.argv[4] == "warm")

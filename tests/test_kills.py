@@ -74,11 +74,11 @@ class Robots(threading.Thread):
 class Victim:
     """A service in a process of its own, and what it acknowledged before it was killed."""
 
-    def __init__(self, folder: Path, checkpoint_s: float = 0.4) -> None:
+    def __init__(self, folder: Path, checkpoint_s: float = 0.4, start: str = "cold") -> None:
         self.endpoint = free_endpoint()
         target = Path(__file__).with_name("kill_target.py")
         self._process = subprocess.Popen(
-            [sys.executable, str(target), str(folder), self.endpoint, str(checkpoint_s)],
+            [sys.executable, str(target), str(folder), self.endpoint, str(checkpoint_s), start],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

@@ -23,7 +23,9 @@ logger = logging.getLogger(__name__)
 VoxelOption = Annotated[
     float | None,
     typer.Option(
-        "--voxel", help="Voxel edge, 0.005 to 1 m.", show_default="0.05; replay: the log's"
+        "--voxel",
+        help="Voxel edge, 0.005 to 1 m. Gaps under ten voxels close.",
+        show_default="0.05; replay: the log's",
     ),
 ]
 ThetaOption = Annotated[
