@@ -146,19 +146,24 @@ def _is_slim(facing):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _look(sources, held, r, corner, plane, tally, t, sums, fresh):  # type: ignore[no-untyped-def]
-    """Find what the members of a run are to their tile-plane, and change its PURE points by it:
-    add them, where they are `fresh`. Sets the margin."""
+def _is_own(border, second, row):  # type: ignore[no-untyped-def]
+    """Whether a voxel holds no points of another surface."""
+    return not (border[row] or second[row] >= 0)
+
+
+@kernel(allocates=False)
+def _look(sources, held, r, corner, plane, slim, tally, t, sums, fresh):  # type: ignore[no-untyped-def]
+    """Find what the members of a run are to their tile-plane, `slim` or not, and change its PURE
+    points by it: add them, where they are `fresh`. Sets the margin."""
     _, columns, border, second = sources
-    slim = _is_slim(tally.facing[t])
     margin = SURE
     for m in range(held.start[r], held.start[r] + held.size[r]):
         if held.state[m] == CLAIMED:
             continue
         row = held.rows[m]
-        local, seen = np.int64(columns.local[row]), columns.observable[row]
         now = MIXED
-        if slim or not (border[row] or second[row] >= 0):
+        if slim or _is_own(border, second, row):
+            local, seen = np.int64(columns.local[row]), columns.observable[row]
             off = (
                 plane[0] * (corner[0] + (local & 7) + (seen & 15) / STEPS)
                 + plane[1] * (corner[1] + ((local >> 3) & 7) + ((seen >> 4) & 15) / STEPS)
@@ -300,7 +305,8 @@ def _finish(  # type: ignore[no-untyped-def]
     elif RIMMED[0] <= f[4] <= RIMMED[1]:
         plane = _settled(_sound(sources, held, span, tile_key), plane)
     tally.planes[t, 0], tally.planes[t, 1], tally.planes[t, 2], tally.planes[t, 3] = plane
-    moved, turned = o < 0, o >= 0 and _is_slim(f) != _is_slim(old.facing[o])
+    slim = _is_slim(f)
+    moved, turned = o < 0, o >= 0 and slim != _is_slim(old.facing[o])
     for a in range(4 * (not moved)):
         moved |= tally.planes[t, a] != old.planes[o, a]
     sums = np.empty(SUMS, np.int64)
@@ -315,7 +321,10 @@ def _finish(  # type: ignore[no-untyped-def]
             held.margin[r] -= np.float32(_drift(corner, old.planes[o], plane) + SLACK)
             look = held.margin[r] <= 0.0
         if look:
-            _look(sources, held, r, corner, plane, tally, t, sums, fresh)
+            if slim:  # each is compiled by itself: a third off where few are slim
+                _look(sources, held, r, corner, plane, True, tally, t, sums, fresh)
+            else:
+                _look(sources, held, r, corner, plane, False, tally, t, sums, fresh)
         if fresh:
             _count(sources, held, r, tally, t, sums)
     start, stop = _rows_of(held, span)
