@@ -110,7 +110,7 @@ def scene(seed: int) -> tuple[Nodes, NDArray[np.int64], list[int]]:
             wall.append(number)
     nodes = nodes_of(sheets)
     gap = np.linalg.norm(nodes.mean[:, None] - nodes.mean[None], axis=2)
-    edges = np.argwhere(np.triu(gap < 13.0, 1)).astype(np.int64)
+    edges = np.argwhere(np.triu(gap < 13.0, 1)).astype(np.int32)
     return nodes, edges, wall
 
 
@@ -175,7 +175,7 @@ def pair(
         (sheet(rng, np.zeros(3), first, 400), first),
         (sheet(rng, np.array(at), np.array(normal), 200), np.array(normal)),
     ]
-    roots, _ = merge_nodes(nodes_of(sheets), np.array([[0, 1]], np.int64), limit)
+    roots, _ = merge_nodes(nodes_of(sheets), np.array([[0, 1]], np.int32), limit)
     return len(np.unique(roots))
 
 
@@ -191,7 +191,7 @@ def test_across_a_gap_places_count_not_noise_and_only_so_far() -> None:
     tight = LIMIT._replace(offset=0.1, reach=8.0)
     rng = np.random.default_rng(3)
     up = np.array([0.0, 0.0, 1.0])
-    edge = np.array([[0, 1]])
+    edge = np.array([[0, 1]], np.int32)
     for away, offset, one in ((30.0, 0.0, True), (30.0, 0.4, False), (90.0, 0.0, False)):
         here = sheet(rng, np.zeros(3), up, 400)
         there = sheet(rng, np.array([away, 0.0, offset]), up, 200)
@@ -205,7 +205,7 @@ def test_what_touches_is_asked_no_reach() -> None:
     """A node of one voxel has no extent at all."""
     up = np.array([0.0, 0.0, 1.0])
     sheets = [(np.zeros((1, 3)), up), (np.array([[1.0, 0.0, 0.0]]), up)]
-    roots, _ = merge_nodes(nodes_of(sheets), np.array([[0, 1]]), LIMIT)
+    roots, _ = merge_nodes(nodes_of(sheets), np.array([[0, 1]], np.int32), LIMIT)
     assert roots.tolist() == [0, 0]
 
 
@@ -220,8 +220,8 @@ def test_far_from_the_origin_nothing_is_different() -> None:
 
 def test_nothing_to_merge() -> None:
     none = Nodes(np.zeros(0), np.zeros((0, 3)), np.zeros((0, 6)), np.zeros((0, 3)))
-    roots, merged = merge_nodes(none, np.zeros((0, 2), np.int64), LIMIT)
+    roots, merged = merge_nodes(none, np.zeros((0, 2), np.int32), LIMIT)
     assert len(roots) == len(merged.votes) == 0
     nodes, _, _ = scene(0)
-    roots, _ = merge_nodes(nodes, np.zeros((0, 2), np.int64), LIMIT)
+    roots, _ = merge_nodes(nodes, np.zeros((0, 2), np.int32), LIMIT)
     assert roots.tolist() == list(range(len(nodes.votes)))

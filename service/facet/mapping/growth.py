@@ -32,7 +32,7 @@ def _tile_nodes(block_keys, neighbours, patches, which, tile_key):  # type: igno
     unit = np.empty((count, 3))
     t = 0
     num_edges = 0
-    edges = np.empty((max(64, 64 * count), 2), np.int64)
+    edges = np.empty((max(64, 64 * count), 2), np.int32)
     for q in range(which.shape[0]):
         block = which[q]
         i, j, k = unpack(block_keys[block])
@@ -65,7 +65,7 @@ def _tile_nodes(block_keys, neighbours, patches, which, tile_key):  # type: igno
                     if n == CENTRE and o <= p:
                         continue
                     if num_edges == edges.shape[0]:
-                        wider = np.empty((2 * num_edges, 2), np.int64)
+                        wider = np.empty((2 * num_edges, 2), np.int32)
                         wider[:num_edges] = edges
                         edges = wider
                     edges[num_edges, 0] = first[place[q]] + p

@@ -126,50 +126,62 @@ def _agreement(nx, ny, nz, unit):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _best_cos(normals, narrow, unit, a, b):  # type: ignore[no-untyped-def]
+def _best_cos(normals, own, a, b):  # type: ignore[no-untyped-def]
     """Cosine between the normals of a and b. A narrow b may have that of its fit or the mean of its
     members', as the one turns with its noise, the other with what lies beside it."""
-    cos = _dot(normals, a, b)
-    if narrow[b]:
-        cos = max(cos, _agreement(normals[a, 0], normals[a, 1], normals[a, 2], unit[b]))
-    return cos
+    n, u = normals[a], own[b]
+    return max(_dot(normals, a, b), n[0] * u[0] + n[1] * u[1] + n[2] * u[2])
 
 
 @kernel(allocates=False)
-def _face(votes, scatter, unit, start, stop, normals, narrow):  # type: ignore[no-untyped-def]
-    """Normals (T, 3) of the nodes from start to stop, and (T,) whether they are narrow."""
+def _face(votes, scatter, unit, start, stop, normals, own):  # type: ignore[no-untyped-def]
+    """Normals (T, 3) of the nodes from start to stop, and their `own` ones (T, 3)."""
     for t in range(start, stop):
         nx, ny, nz, _, across = plane_of(votes[t], scatter[t], unit[t])
-        normals[t, 0], normals[t, 1], normals[t, 2] = nx, ny, nz
-        narrow[t] = 12.0 * across < NARROW * NARROW
+        _turn(t, nx, ny, nz, across, unit[t], normals, own)
 
 
 @kernel(allocates=False)
-def _weigh(votes, mean, unit, normals, narrow, edges, start, stop, limit, costs):  # type: ignore[no-untyped-def]
-    """Costs (E,) of merging along the edges from start to stop; inf where the two ends of one
-    disagree by themselves."""
+def _turn(t, nx, ny, nz, across, unit, normals, own):  # type: ignore[no-untyped-def]
+    """Give a node its normal, and its own one: the mean of its members' where it is narrow."""
+    normals[t, 0], normals[t, 1], normals[t, 2] = nx, ny, nz
+    if 12.0 * across < NARROW * NARROW:
+        length = np.sqrt(unit[0] * unit[0] + unit[1] * unit[1] + unit[2] * unit[2])
+        nx, ny, nz = unit[0] / length, unit[1] / length, unit[2] / length
+    own[t, 0], own[t, 1], own[t, 2] = nx, ny, nz
+
+
+@kernel(allocates=False)
+def _weigh(votes, mean, normals, own, edges, start, stop, limit, worth, costs):  # type: ignore[no-untyped-def]
+    """List the edges from start to stop whose two ends agree by themselves: their numbers, worth
+    (E,), and the costs (E,) of merging along them, from `start` on. Returns where these end."""
+    num = start
     for e in range(start, stop):
         a, b = edges[e, 0], edges[e, 1]
         if votes[b] > votes[a]:
             a, b = b, a
-        costs[e] = np.inf
-        cos = _best_cos(normals, narrow, unit, a, b)
+        cos = _best_cos(normals, own, a, b)
         if cos < limit.edge_cos:  # most of them
             continue
         w = abs(_offset(normals, mean, a, b))
         if w <= limit.offset:
-            costs[e] = (1.0 - cos) / (1.0 - limit.edge_cos) + (w / limit.offset) ** 2
+            worth[num] = e
+            costs[num] = (1.0 - cos) / (1.0 - limit.edge_cos) + (w / limit.offset) ** 2
+            num += 1
+    return num
 
 
 @kernel(parallel=True)
-def _weigh_many(votes, mean, scatter, unit, edges, limit, normals, narrow, costs):  # type: ignore[no-untyped-def]
+def _weigh_many(votes, mean, scatter, unit, edges, limit, normals, own, worth, costs, ends):  # type: ignore[no-untyped-def]
     count, num = votes.shape[0], edges.shape[0]
     for share in prange(SHARES):
         start, stop = share * count // SHARES, (share + 1) * count // SHARES
-        _face(votes, scatter, unit, start, stop, normals, narrow)
+        _face(votes, scatter, unit, start, stop, normals, own)
     for share in prange(SHARES):
         start, stop = share * num // SHARES, (share + 1) * num // SHARES
-        _weigh(votes, mean, unit, normals, narrow, edges, start, stop, limit, costs)
+        ends[share] = _weigh(
+            votes, mean, normals, own, edges, start, stop, limit, worth, costs
+        )  # fmt: skip
 
 
 @kernel(allocates=False)
@@ -194,10 +206,10 @@ def _reaches(votes, mean, scatter, to, reach):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _try(votes, mean, scatter, unit, normals, narrow, a, b, limit, m, s, u):  # type: ignore[no-untyped-def]
+def _try(votes, mean, scatter, unit, normals, own, a, b, limit, m, s, u):  # type: ignore[no-untyped-def]
     """Whether a and b (a the larger) are one plane; m, s, u are then its statistics, and what comes
     with it its normal and the variance across it."""
-    if _best_cos(normals, narrow, unit, a, b) < limit.cos:
+    if _best_cos(normals, own, a, b) < limit.cos:
         return False, 0.0, 0.0, 0.0, 0.0
     w = _offset(normals, mean, a, b)
     if abs(w) > limit.offset:
@@ -224,7 +236,7 @@ def _try(votes, mean, scatter, unit, normals, narrow, a, b, limit, m, s, u):  # 
 
 
 @kernel
-def _merge(votes, mean, scatter, unit, normals, narrow, edges, limit):  # type: ignore[no-untyped-def]
+def _merge(votes, mean, scatter, unit, normals, own, edges, limit):  # type: ignore[no-untyped-def]
     """Merge nodes along edges (E, 2), given best first. The statistics end as those of the merged
     nodes, at the root's row. Returns (T,) the root of each node: its smallest member."""
     count = votes.shape[0]
@@ -242,7 +254,7 @@ def _merge(votes, mean, scatter, unit, normals, narrow, edges, limit):  # type: 
             tried[e, 0], tried[e, 1] = version[a], version[b]
             large, small = (a, b) if votes[a] >= votes[b] else (b, a)
             one, nx, ny, nz, across = _try(
-                votes, mean, scatter, unit, normals, narrow, large, small, limit, m, s, u
+                votes, mean, scatter, unit, normals, own, large, small, limit, m, s, u
             )
             if not one:
                 continue
@@ -251,8 +263,7 @@ def _merge(votes, mean, scatter, unit, normals, narrow, edges, limit):  # type: 
             parent[drop] = keep
             votes[keep] = votes[a] + votes[b]
             mean[keep], scatter[keep], unit[keep] = m, s, u
-            narrow[keep] = 12.0 * across < NARROW * NARROW
-            normals[keep, 0], normals[keep, 1], normals[keep, 2] = nx, ny, nz
+            _turn(keep, nx, ny, nz, across, u, normals, own)
             version[keep] = version[a] + version[b] + 1
     for t in range(count):
         parent[t] = _root(parent, t)
@@ -260,11 +271,16 @@ def _merge(votes, mean, scatter, unit, normals, narrow, edges, limit):  # type: 
 
 
 @kernel
-def _merge_worth(votes, mean, scatter, unit, normals, narrow, edges, costs, limit):  # type: ignore[no-untyped-def]
-    """Merge nodes along those edges that are worth it, best first."""
-    worth = np.flatnonzero(costs < np.inf)
-    best_first = worth[np.argsort(costs[worth], kind="mergesort")]
-    return _merge(votes, mean, scatter, unit, normals, narrow, edges[best_first], limit)
+def _merge_worth(votes, mean, scatter, unit, normals, own, edges, worth, costs, ends, limit):  # type: ignore[no-untyped-def]
+    """Merge nodes along the edges that are worth it, as `_weigh` listed them in S parts of all
+    edges, each up to one of ends (S,), best first."""
+    parts, num = ends.shape[0], 0
+    for part in range(parts):  # one part is moved to where the one before ends
+        for at in range(part * edges.shape[0] // parts, ends[part]):
+            worth[num], costs[num] = worth[at], costs[at]
+            num += 1
+    best_first = worth[:num][np.argsort(costs[:num], kind="mergesort")]
+    return _merge(votes, mean, scatter, unit, normals, own, edges[best_first], limit)
 
 
 @kernel
@@ -273,23 +289,26 @@ def merge_all(votes, mean, scatter, unit, edges, limit):  # type: ignore[no-unty
     as those of the merged nodes, at the root's row. Returns (T,) the root of each node: its
     smallest member."""
     count, num = votes.shape[0], edges.shape[0]
-    normals, narrow, costs = np.empty((count, 3)), np.empty(count, np.bool_), np.empty(num)
-    _face(votes, scatter, unit, 0, count, normals, narrow)
-    _weigh(votes, mean, unit, normals, narrow, edges, 0, num, limit, costs)
-    return _merge_worth(votes, mean, scatter, unit, normals, narrow, edges, costs, limit)
+    normals, own = np.empty((count, 3)), np.empty((count, 3))
+    worth, costs, ends = np.empty(num, np.int32), np.empty(num), np.empty(1, np.int64)
+    _face(votes, scatter, unit, 0, count, normals, own)
+    ends[0] = _weigh(votes, mean, normals, own, edges, 0, num, limit, worth, costs)
+    return _merge_worth(
+        votes, mean, scatter, unit, normals, own, edges, worth, costs, ends, limit
+    )  # fmt: skip
 
 
 def merge_nodes(
-    nodes: Nodes, edges: NDArray[np.int64], limit: Limits
+    nodes: Nodes, edges: NDArray[np.int32], limit: Limits
 ) -> tuple[NDArray[np.int64], Nodes]:
     """Merge `nodes` along `edges` (E, 2), which must come in a canonical order.
 
     Returns (root of each node (T,), statistics with the merged ones at the roots' rows)."""
     merged = Nodes(*(column.copy() for column in nodes))
-    if len(edges) < MANY:
+    count, num = len(nodes.votes), len(edges)
+    if num < MANY:
         return merge_all(*merged, edges, limit), merged
-    count = len(nodes.votes)
-    judged = np.empty((count, 3)), np.empty(count, np.bool_)
-    costs = np.empty(len(edges))
-    _weigh_many(*merged, edges, limit, *judged, costs)
-    return _merge_worth(*merged, *judged, edges, costs, limit), merged
+    judged = np.empty((count, 3)), np.empty((count, 3))
+    listed = np.empty(num, np.int32), np.empty(num), np.empty(SHARES, np.int64)
+    _weigh_many(*merged, edges, limit, *judged, *listed)
+    return _merge_worth(*merged, *judged, edges, *listed, limit), merged

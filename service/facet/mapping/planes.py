@@ -87,7 +87,7 @@ def group_planes(
 @kernel
 def _every_pair(count):  # type: ignore[no-untyped-def]
     """(E, 2) all edges between `count` nodes, ascending."""
-    out, num = np.empty((count * (count - 1) // 2, 2), np.int64), 0
+    out, num = np.empty((count * (count - 1) // 2, 2), np.int32), 0
     for a in range(count):
         for b in range(a + 1, count):
             out[num, 0], out[num, 1] = a, b
@@ -151,42 +151,44 @@ def _average_sigma(nodes: Nodes) -> float:
 
 
 @kernel(allocates=False)
-def _fits(votes, mean, scatter, unit, t, normal, centre, limit):  # type: ignore[no-untyped-def]
-    """RMS distance of a node's voxels to a plane, or -1 where it does not belong there."""
-    u = unit[t]
-    length = np.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
-    cos = (u[0] * normal[0] + u[1] * normal[1] + u[2] * normal[2]) / length
-    if cos < 2.0 * limit.cos * limit.cos - 1.0:  # twice the angle
+def _fits(mean, scatter, unit, t, size, share, normal, centre, limit):  # type: ignore[no-untyped-def]
+    """Mean square distance of a node's voxels to a plane, or -1 where it does not belong there.
+    size: the length of its `unit`; share: 1 over its votes."""
+    n, u = normal, unit[t]
+    cos = 2.0 * limit.cos * limit.cos - 1.0  # of twice the angle
+    if u[0] * n[0] + u[1] * n[1] + u[2] * n[2] < cos * size:
         return -1.0
     w = 0.0
     for a in range(3):
-        w += normal[a] * (mean[t, a] - centre[a])
+        w += n[a] * (mean[t, a] - centre[a])
+    if abs(w) > limit.offset:
+        return -1.0
     s = scatter[t]
-    n = normal
-    spread = (
+    spread = share * (
         s[0] * n[0] * n[0] + s[3] * n[1] * n[1] + s[5] * n[2] * n[2]
         + 2.0 * (s[1] * n[0] * n[1] + s[2] * n[0] * n[2] + s[4] * n[1] * n[2])
-    ) / votes[t]  # fmt: skip
-    rms = np.sqrt(max(0.0, spread) + w * w)
-    return rms if rms <= limit.offset else -1.0
+    )  # fmt: skip
+    square = max(0.0, spread) + w * w
+    return square if square <= limit.offset * limit.offset else -1.0
 
 
-@kernel(allocates=False)
-def _adopt_along(nodes, edges, label, normals, centres, limit, room):  # type: ignore[no-untyped-def]
-    """Offer free nodes to the planes of their neighbours, nearest first, until nothing changes.
-
-    room: is_free (T,), which are; loose (E,), edges that may offer something yet; best (T,), FREE,
-    best_rms (T,), inf, and taken (T,)."""
+@kernel
+def _adopt_along(nodes, edges, label, normals, centres, limit):  # type: ignore[no-untyped-def]
+    """Offer free nodes to the planes of their neighbours, nearest first, until nothing changes:
+    label (T,)."""
     votes, mean, scatter, unit = nodes
-    is_free, loose, best, best_rms, taken = room
-    num = 0
-    for e in range(edges.shape[0]):  # an edge without a free end offers none
-        loose[num] = e
-        num += is_free[edges[e, 0]] | is_free[edges[e, 1]]
-    for _ in range(ADOPTIONS):
+    count, num = votes.shape[0], edges.shape[0]
+    size, share = np.empty(count), np.empty(count)
+    for t in range(count):
+        u = unit[t]
+        size[t] = np.sqrt(u[0] * u[0] + u[1] * u[1] + u[2] * u[2])
+        share[t] = 1.0 / votes[t]
+    is_free, best, nearest = label == FREE, np.full(count, FREE), np.full(count, np.inf)
+    taken, loose = np.empty(count, np.int64), np.empty(num, np.int32)
+    for turn in range(ADOPTIONS):
         left, num_taken = 0, 0
         for at in range(num):
-            e = loose[at]
+            e = np.int64(loose[at]) if turn else at
             t, other = edges[e, 0], edges[e, 1]
             if is_free[t] and is_free[other]:  # perhaps later
                 loose[left] = e
@@ -197,12 +199,12 @@ def _adopt_along(nodes, edges, label, normals, centres, limit, room):  # type: i
             if not is_free[t]:  # neither is any more
                 continue
             p = label[other]
-            rms = _fits(votes, mean, scatter, unit, t, normals[p], centres[p], limit)
-            if rms >= 0.0 and (rms < best_rms[t] or (rms == best_rms[t] and p < best[t])):
+            own = _fits(mean, scatter, unit, t, size[t], share[t], normals[p], centres[p], limit)
+            if own >= 0.0 and (own < nearest[t] or (own == nearest[t] and p < best[t])):
                 if best[t] == FREE:
                     taken[num_taken] = t
                     num_taken += 1
-                best[t], best_rms[t] = p, rms
+                best[t], nearest[t] = p, own
         for at in range(num_taken):
             label[taken[at]] = best[taken[at]]
             is_free[taken[at]] = False
@@ -216,10 +218,7 @@ def _adopt(
 ) -> NDArray[np.int64]:
     label = label.copy()
     normals = _fits_of(nodes.votes, nodes.scatter, nodes.unit)[:, :3]
-    size, num_edges = len(label), len(table.edges)
-    best, taken = np.full(size, FREE), np.empty(size, np.int64)
-    room = label == FREE, np.empty(num_edges, np.int32), best, np.full(size, np.inf), taken
-    _adopt_along(table.nodes, table.edges, label, normals, nodes.mean, limit, room)
+    _adopt_along(table.nodes, table.edges, label, normals, nodes.mean, limit)
     return label
 
 

@@ -26,7 +26,7 @@ class Table(NamedTuple):
     starts: NDArray[np.int64]  # (L + 1,) first node of each tile
     nodes: Nodes  # (T, ...)
     occupation: NDArray[np.int64]  # (T,) voxels
-    edges: NDArray[np.int64]  # (E, 2) adjacent nodes, ascending
+    edges: NDArray[np.int32]  # (E, 2) adjacent nodes, ascending
     points: NDArray[np.int64]  # (T, 10) exact moments of pure points about the tile corner
     total: NDArray[np.int64]  # (T,) points of all members
     tile_of: NDArray[np.int64]  # (T,) index into tile_keys
@@ -58,7 +58,7 @@ class Tabulator:
         self._find_near(np.array(keys, np.int64))
         self._starts, self._pair_starts, self._whole = starts, pair_starts, whole
         self._parts = {k: (n, part) for n, (k, part) in enumerate(zip(keys, parts, strict=True))}
-        edges = np.empty((len(whole[PAIRS]), 2), np.int64)
+        edges = np.empty((len(whole[PAIRS]), 2), np.int32)
         _number(whole[PAIRS], pair_starts, starts, self._near, edges)
         return Table(
             self._keys, starts, Nodes(*whole[:OCCUPATION]), whole[OCCUPATION], edges, whole[POINTS],
