@@ -7,7 +7,7 @@ import pytest
 
 from facet.mapping.contours import make_frame, round_normal
 from facet.mapping.freespace import CELL, FreeSpace
-from facet.mapping.openings import hole_kind, probes
+from facet.mapping.openings import hole_kind, probes, samples
 from facet.mapping.quantise import quantise
 from facet.mapping.settings import MapSettings
 from facet_protocol.messages import HoleKind
@@ -39,11 +39,11 @@ def beams(seed: int, low: float, high: float, end: float = 4.0, count: int = 400
 
 
 def kind_of(free: FreeSpace, ring: np.ndarray) -> HoleKind:
-    return hole_kind(probes(ring, FRAME, INSIDE, OFFSET, SETTINGS), free, SETTINGS)
+    return hole_kind(probes(samples(ring), FRAME, INSIDE, OFFSET, SETTINGS), free, SETTINGS)
 
 
 def test_probes_lie_before_on_and_behind_the_plane() -> None:
-    found = probes(hole_at(1.5, 1.0, 1.0, 1.2), FRAME, INSIDE, OFFSET, SETTINGS)
+    found = probes(samples(hole_at(1.5, 1.0, 1.0, 1.2)), FRAME, INSIDE, OFFSET, SETTINGS)
     world = (found + 0.5) * SETTINGS.tick_m
     before, on, behind = world
     step = CELL * SETTINGS.voxel_m

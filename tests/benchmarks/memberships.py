@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from facet.mapping.contours import make_frame, round_normal
 from facet.mapping.freespace import FreeSpace
-from facet.mapping.openings import hole_kind, probes
+from facet.mapping.openings import hole_kind, probes, samples
 from facet.mapping.pivot import CELLS, HALO, SIDE, boundary_edges
 from facet.mapping.rings import Outline, surfaces_of
 from facet.mapping.settings import STEPS, MapSettings
@@ -75,7 +75,7 @@ def _surface(
     settings: MapSettings,
 ) -> dict[str, Any]:
     holes = [
-        (hole_kind(probes(hole, frame, inside, offset, settings), free, settings), hole)
+        (hole_kind(probes(samples(hole), frame, inside, offset, settings), free, settings), hole)
         for hole in outline.holes
     ]
     return {

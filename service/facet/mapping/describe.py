@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from facet.mapping.contours import Contour
 from facet.mapping.fitting import Fit
 from facet.mapping.freespace import FreeSpace
-from facet.mapping.openings import hole_kind, probes
+from facet.mapping.openings import hole_kind, probes, samples
 from facet.mapping.rings import Outline
 from facet.mapping.settings import MapSettings
 from facet.mapping.witness import Sighting
@@ -56,7 +56,8 @@ class _Entry:
     own: Figures
     key: tuple[bytes, ...]
     outlines: list[Outline]
-    probes: list[list[NDArray[np.int64]]]  # by outline and hole
+    samples: list[list[NDArray[np.float64]]]  # by outline and hole
+    probes: list[list[NDArray[np.int64]]]  # the same, lifted to the plane
     kinds: list[list[HoleKind]]
     plane: Plane
 
@@ -109,24 +110,25 @@ class Describer:
 
     def _refresh(self, plane_id: int, own: Figures, contour: Contour, free: FreeSpace) -> bool:
         old = self._entries.get(plane_id)
-        known = old is not None and old.own is own and old.outlines is contour.outlines
-        key = old.key if known and old is not None else _key(own, contour)
-        same = old is not None and old.key == key and old.outlines is contour.outlines
-        found = old.probes if same and old is not None else self._probes(own.fit, contour)
+        drawn = old if old is not None and old.outlines is contour.outlines else None
+        key = drawn.key if drawn is not None and drawn.own is own else _key(own, contour)
+        same = drawn if drawn is not None and drawn.key == key else None
+        points = drawn.samples if drawn is not None else _samples(contour)
+        found = same.probes if same is not None else self._lift(points, own.fit, contour)
         kinds = [[hole_kind(p, free, self._settings) for p in holes] for holes in found]
-        if same and old is not None and old.kinds == kinds:
+        if same is not None and same.kinds == kinds:
             return False
         revision = old.plane.revision + 1 if old is not None else 1
         surfaces = self._surfaces(contour, kinds, old)
         plane = _plane(plane_id, revision, own, contour, surfaces)
-        self._entries[plane_id] = _Entry(own, key, contour.outlines, found, kinds, plane)
+        self._entries[plane_id] = _Entry(own, key, contour.outlines, points, found, kinds, plane)
         return True
 
-    def _probes(self, fit: Fit, contour: Contour) -> list[list[NDArray[np.int64]]]:
-        return [
-            [probes(h, contour.frame, fit.inside, fit.offset_m, self._settings) for h in o.holes]
-            for o in contour.outlines
-        ]
+    def _lift(
+        self, points: list[list[NDArray[np.float64]]], fit: Fit, contour: Contour
+    ) -> list[list[NDArray[np.int64]]]:
+        on = contour.frame, fit.inside, fit.offset_m, self._settings
+        return [[probes(own, *on) for own in holes] for holes in points]
 
     def _surfaces(
         self, contour: Contour, kinds: list[list[HoleKind]], old: _Entry | None
@@ -168,6 +170,10 @@ class Describer:
                 ids[index] = self._next_surface
                 self._next_surface += 1
         return ids
+
+
+def _samples(contour: Contour) -> list[list[NDArray[np.float64]]]:
+    return [[samples(hole) for hole in outline.holes] for outline in contour.outlines]
 
 
 def _centre(ring: NDArray[np.int32], frame: object) -> NDArray[np.float64]:

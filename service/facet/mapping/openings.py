@@ -51,17 +51,22 @@ def _lift(uv, axis_u, axis_v, axis_n, normal, offset, step, tick):  # type: igno
     return out
 
 
+def samples(ring: NDArray[np.int32]) -> NDArray[np.float64]:
+    """(N, 2) points in a hole, half a cell of free space apart, 1/8 voxel."""
+    return np.asarray(_samples(ring, PITCH))
+
+
 def probes(
-    ring: NDArray[np.int32],
+    points: NDArray[np.float64],
     frame: PlaneFrame,
     normal: NDArray[np.float64],
     offset_m: float,
     settings: MapSettings,
 ) -> NDArray[np.int64]:
     """(3, N, 3) ticks: samples of a hole before, on and behind the plane normal . x = offset_m."""
-    uv = _samples(ring, PITCH) * frame.step_m
-    step_m, axes = CELL * settings.voxel_m, (frame.axis_u, frame.axis_v, frame.axis_n)
-    return np.asarray(_lift(uv, *axes, normal, offset_m, step_m, settings.voxel_m / TICKS))
+    uv, axes = points * frame.step_m, (frame.axis_u, frame.axis_v, frame.axis_n)
+    step_m, tick_m = CELL * settings.voxel_m, settings.voxel_m / TICKS
+    return np.asarray(_lift(uv, *axes, normal, offset_m, step_m, tick_m))
 
 
 def hole_kind(probe: NDArray[np.int64], free: FreeSpace, settings: MapSettings) -> HoleKind:
