@@ -103,8 +103,10 @@ def test_the_same_loop_again_and_again_grows_nothing() -> None:
 GROWS = """
 import gc
 from benchmarks import buildings, growth, inside
+from facet.mapping import memory
 from facet.mapping.mapper import Mapper
 
+memory.LARGE_PAGES = "MADV_NOHUGEPAGE"
 mapper, looks = Mapper(), buildings.office(100)
 sources, rows = growth.all_copies(looks), []
 mapper._normals._traces.entries[...] = 0  # bounded: all of it from the start

@@ -6,6 +6,7 @@ row comes into use; then the room that a column has in reserve is free."""
 
 from __future__ import annotations
 
+import math
 import mmap
 from collections.abc import Iterator
 from contextlib import suppress
@@ -16,6 +17,8 @@ from numpy.typing import DTypeLike, NDArray
 
 Column = NDArray[Any]
 CHUNK = 1 << 20  # bytes that are looked at at a time
+SMALL = 4 << 20  # bytes: two large pages
+LARGE_PAGES = "MADV_HUGEPAGE"  # fewer of them are looked up
 C = TypeVar("C", bound=tuple[Any, ...])
 
 
@@ -39,7 +42,7 @@ class Heap:
 
     def grown(self, column: Column, used: int, capacity: int) -> Column:
         """A copy, see `Memory`."""
-        out = np.zeros((capacity, *column.shape[1:]), column.dtype)
+        out = _promised((capacity, *column.shape[1:]), column.dtype)
         for part in _written(column[:used]):  # a copy of zeros would take memory
             out[part] = column[part]
         return out
@@ -59,13 +62,24 @@ def copied(memory: Memory, column: Column, used: int) -> Column:
 def sparse(count: int, dtype: DTypeLike) -> Column:
     """Zeros (count,) of which little will be written, in small pages: what is zeroed for each touch
     of large ones can cost more than what is done there."""
-    kind = np.dtype(dtype)
-    flags = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
-    room = mmap.mmap(-1, count * kind.itemsize, flags)
-    if hasattr(mmap, "MADV_NOHUGEPAGE"):
-        with suppress(OSError):  # from a system that has none
-            room.madvise(mmap.MADV_NOHUGEPAGE)
-    return np.frombuffer(room, kind)
+    return _mapped(count, np.dtype(dtype), "MADV_NOHUGEPAGE")
+
+
+def _promised(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Column:
+    """Zeros that take no memory until they are written. `np.zeros` writes them where it is given
+    memory that was in use before."""
+    count = math.prod(shape)
+    if count * dtype.itemsize < SMALL:
+        return np.zeros(shape, dtype)
+    return _mapped(count, dtype, LARGE_PAGES).reshape(shape)
+
+
+def _mapped(count: int, dtype: np.dtype[Any], advice: str) -> Column:
+    room = mmap.mmap(-1, count * dtype.itemsize, mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    if hasattr(mmap, advice):
+        with suppress(OSError):  # from a system that has no such pages
+            room.madvise(getattr(mmap, advice))
+    return np.frombuffer(room, dtype)
 
 
 def grow_all(memory: Memory, columns: C, used: int, capacity: int) -> C:
