@@ -25,7 +25,7 @@ from facet_protocol.messages import Envelope
 from rig import WAIT_S, wait_until
 from test_kills import NUM_ROBOTS, RATE_HZ, Robots, Victim, small_scans
 
-WARM_S = 3.0  # kernels are loaded
+WARM_S = 3.0  # the first scans are in the map
 MESSAGE_S = 1.0 / (NUM_ROBOTS * RATE_HZ)
 FLOOD = (1000, 20_000)  # connections, junk messages a second
 SMALL_FLOOD = (300, 2_000)

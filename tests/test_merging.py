@@ -93,7 +93,7 @@ def test_limits_follow_the_noise_within_bounds() -> None:
         assert limit.edge_cos <= limit.cos
 
 
-def scene(seed: int) -> tuple[Nodes, NDArray[np.int64], list[int]]:
+def scene(seed: int) -> tuple[Nodes, NDArray[np.int32], list[int]]:
     """Patches of two walls that meet and of a parallel one, with edges between near ones."""
     rng = np.random.default_rng(seed)
     sheets, wall = [], []
