@@ -68,6 +68,7 @@ class Contour:
     cells: dict[Place, Cells] = field(default_factory=dict)
     edges: dict[Place, NDArray[np.int32]] = field(default_factory=dict)
     outlines: list[Outline] = field(default_factory=list)
+    normal: NDArray[np.float64] | None = None  # that was rounded last
 
     def put(self, member: Member, share: Share) -> list[Place]:
         """Take a share in. Returns where it falls."""
@@ -154,14 +155,18 @@ class ContourField:
         in tiles other than `changed`."""
         again = []
         for plane_id, normal in normals.items():
-            rounded, contour = round_normal(normal), self.contours.get(plane_id)
+            contour = self.contours.get(plane_id)
+            if contour is not None and contour.normal is normal:
+                continue
+            rounded = round_normal(normal)
             if contour is None or contour.rounded != rounded:
                 for key, stamp in contour.shares if contour else ():
                     if key not in changed:
                         t = int(np.flatnonzero(tiles[key].stamps == stamp)[0])
                         again.append((plane_id, key, stamp, t))
-                frame = make_frame(rounded, self._voxel_m)
-                self.contours[plane_id] = Contour(rounded, frame)
+                contour = Contour(rounded, make_frame(rounded, self._voxel_m))
+                self.contours[plane_id] = contour
+            contour.normal = normal
         return again
 
     def _shares(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 
 from facet.mapping.contours import Contour
 from facet.mapping.fitting import Fit
-from facet.mapping.freespace import FreeSpace
+from facet.mapping.freespace import FreeSpace, blocks_of
 from facet.mapping.openings import hole_kind, probes, samples
 from facet.mapping.rings import Outline
 from facet.mapping.settings import MapSettings
@@ -58,8 +59,13 @@ class _Entry:
     outlines: list[Outline]
     samples: list[list[NDArray[np.float64]]]  # by outline and hole
     probes: list[list[NDArray[np.int64]]]  # the same, lifted to the plane
+    blocks: set[int]  # of free space, where these lie
     kinds: list[list[HoleKind]]
     plane: Plane
+
+    def is_of(self, contour: Contour) -> bool:
+        """Whether the contour is as it was."""
+        return self.outlines is contour.outlines
 
 
 class Describer:
@@ -68,6 +74,9 @@ class Describer:
     def __init__(self, settings: MapSettings) -> None:
         self._settings = settings
         self._entries: dict[int, _Entry] = {}
+        self._holed: defaultdict[int, set[int]] = defaultdict(set)  # planes with holes there, by
+        # block of free space
+        self._then = 0  # when free space was last looked at
         self._next_surface = 1
 
     @property
@@ -101,27 +110,44 @@ class Describer:
     ) -> list[int]:
         """Describe all planes again where anything changed. Returns the changed ids, ascending."""
         for gone in self._entries.keys() - figures.keys():
-            del self._entries[gone]
-        return [
-            plane_id
-            for plane_id in sorted(figures)
-            if self._refresh(plane_id, figures[plane_id], contours[plane_id], free)
-        ]
+            self._forget(gone)
+        passed = (self._holed.get(key, set()) for key in free.passed_since(self._then))
+        again = set[int]().union(*passed)
+        self._then = free.now - 1
+        for plane_id, own in figures.items():
+            old = self._entries.get(plane_id)
+            if old is None or old.own is not own or not old.is_of(contours[plane_id]):
+                again.add(plane_id)
+        return [i for i in sorted(again) if self._refresh(i, figures[i], contours[i], free)]
+
+    def _forget(self, plane_id: int) -> None:
+        for block in self._entries.pop(plane_id).blocks:
+            self._holed[block].discard(plane_id)
+            if not self._holed[block]:
+                del self._holed[block]
 
     def _refresh(self, plane_id: int, own: Figures, contour: Contour, free: FreeSpace) -> bool:
         old = self._entries.get(plane_id)
-        drawn = old if old is not None and old.outlines is contour.outlines else None
+        drawn = old if old is not None and old.is_of(contour) else None
         key = drawn.key if drawn is not None and drawn.own is own else _key(own, contour)
         same = drawn if drawn is not None and drawn.key == key else None
-        points = drawn.samples if drawn is not None else _samples(contour)
+        points = drawn.samples if drawn is not None else _samples(contour, old)
         found = same.probes if same is not None else self._lift(points, own.fit, contour)
         kinds = [[hole_kind(p, free, self._settings) for p in holes] for holes in found]
         if same is not None and same.kinds == kinds:
+            same.own = own
             return False
+        blocks = same.blocks if same is not None else _blocks(found)
         revision = old.plane.revision + 1 if old is not None else 1
         surfaces = self._surfaces(contour, kinds, old)
         plane = _plane(plane_id, revision, own, contour, surfaces)
-        self._entries[plane_id] = _Entry(own, key, contour.outlines, points, found, kinds, plane)
+        if old is not None and same is None:
+            self._forget(plane_id)
+        for block in blocks:
+            self._holed[block].add(plane_id)
+        self._entries[plane_id] = _Entry(
+            own, key, contour.outlines, points, found, blocks, kinds, plane
+        )
         return True
 
     def _lift(
@@ -149,7 +175,7 @@ class Describer:
 
     def _surface_ids(self, contour: Contour, old: _Entry | None) -> list[int]:
         """The nearest surface of the last description keeps its id, largest first."""
-        if old is not None and old.outlines is contour.outlines:
+        if old is not None and old.is_of(contour):
             return [surface.id for surface in old.plane.surfaces]
         ids = [0] * len(contour.outlines)
         if old is not None:
@@ -172,8 +198,21 @@ class Describer:
         return ids
 
 
-def _samples(contour: Contour) -> list[list[NDArray[np.float64]]]:
-    return [[samples(hole) for hole in outline.holes] for outline in contour.outlines]
+def _samples(contour: Contour, old: _Entry | None) -> list[list[NDArray[np.float64]]]:
+    """Samples of the holes, taken again where no hole was the same before."""
+    known = dict[bytes, NDArray[np.float64]]()
+    for outline, own in zip(old.outlines, old.samples, strict=True) if old is not None else ():
+        known.update(zip((hole.tobytes() for hole in outline.holes), own, strict=True))
+    return [
+        [known[k] if (k := hole.tobytes()) in known else samples(hole) for hole in outline.holes]
+        for outline in contour.outlines
+    ]
+
+
+def _blocks(probes: list[list[NDArray[np.int64]]]) -> set[int]:
+    """Blocks of free space that the probes of holes lie in."""
+    each = (blocks_of(own).tolist() for holes in probes for own in holes)
+    return set[int]().union(*each)
 
 
 def _centre(ring: NDArray[np.int32], frame: object) -> NDArray[np.float64]:

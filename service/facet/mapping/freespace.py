@@ -13,6 +13,7 @@ from facet.mapping.settings import TICKS
 
 CELL = 4  # voxels per cell edge
 SHIFT = 12  # ticks to cells: 2^12 = CELL * TICKS
+IN_BLOCK = SHIFT + 3  # ticks to blocks of 8 cells
 BEAMS_OF = 8  # of a cloud's beams one in so many, a power of two, is followed: by a hash of its end
 FAR = np.int64(1) << 62  # an axis whose last cell is reached goes no farther
 FIRST_BLOCKS = 1024  # capacity to begin with
@@ -33,9 +34,9 @@ def _block(table, keys, num_blocks, key):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _pass(table, counts, keys, num_blocks, a, b, sign, ends):  # type: ignore[no-untyped-def]
-    """Count a beam from a to b (ticks) in every cell it passes; the last one only if nothing is
-    there (`ends` false). Amanatides & Woo 1987, in integers."""
+def _pass(table, counts, keys, passed, num_blocks, a, b, sign, ends):  # type: ignore[no-untyped-def]
+    """Count a beam from a to b (ticks) in every cell it passes, and note in which blocks these are;
+    the last one only if nothing is there (`ends` false). Amanatides & Woo 1987, in integers."""
     i, j, k = a[0] >> SHIFT, a[1] >> SHIFT, a[2] >> SHIFT
     ei, ej, ek = b[0] >> SHIFT, b[1] >> SHIFT, b[2] >> SHIFT
     d0, d1, d2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
@@ -58,6 +59,7 @@ def _pass(table, counts, keys, num_blocks, a, b, sign, ends):  # type: ignore[no
         key = pack(i >> 3, j >> 3, k >> 3)
         if key != last:
             block, num_blocks = _block(table, keys, num_blocks, key)
+            passed[0][block] = passed[1]
             last = key
         counts[block, (i & 7) + 8 * (j & 7) + 64 * (k & 7)] += sign
         if e01 <= 0 and e02 <= 0:
@@ -71,6 +73,7 @@ def _pass(table, counts, keys, num_blocks, a, b, sign, ends):  # type: ignore[no
             e02, e12 = (e02 - l0, e12 - l1) if k != ek else (-FAR, -FAR)
     if not ends:
         block, num_blocks = _block(table, keys, num_blocks, pack(i >> 3, j >> 3, k >> 3))
+        passed[0][block] = passed[1]
         counts[block, (i & 7) + 8 * (j & 7) + 64 * (k & 7)] += sign
     return num_blocks
 
@@ -78,17 +81,19 @@ def _pass(table, counts, keys, num_blocks, a, b, sign, ends):  # type: ignore[no
 @kernel(allocates=False)
 def _blocks_apart(a, b):  # type: ignore[no-untyped-def]
     """Blocks between two points (ticks), axis by axis."""
-    shift = SHIFT + 3
     total = 0
     for axis in range(3):
-        total += abs((a[axis] >> shift) - (b[axis] >> shift))
+        total += abs((a[axis] >> IN_BLOCK) - (b[axis] >> IN_BLOCK))
     return total
 
 
 @kernel(allocates=False)
-def _pass_all(table, counts, keys, num_blocks, scans, points, starts, start, sign, ends):  # type: ignore[no-untyped-def]
+def _pass_all(  # type: ignore[no-untyped-def]
+    table, counts, keys, passed, num_blocks, scans, points, starts, start, sign, ends
+):
     """Follow the chosen beams from `start` on, those of scans (S,) with (sensors, pose_hashes)
-    beginning at starts (S + 1,). Returns (next beam, number of blocks)."""
+    beginning at starts (S + 1,). passed: when blocks were passed last (B,), and what time it is.
+    Returns (next beam, number of blocks)."""
     sensors, pose_hashes = scans
     scan, every = -1, 1
     for p in range(start, points.shape[0]):
@@ -104,7 +109,7 @@ def _pass_all(table, counts, keys, num_blocks, scans, points, starts, start, sig
         most = 3 + _blocks_apart(sensor, points[p])  # that this beam can add
         if num_blocks + most > counts.shape[0]:
             return p, num_blocks
-        num_blocks = _pass(table, counts, keys, num_blocks, sensor, points[p], sign, ends)
+        num_blocks = _pass(table, counts, keys, passed, num_blocks, sensor, points[p], sign, ends)
     return points.shape[0], num_blocks
 
 
@@ -127,6 +132,19 @@ def passed_all(table_keys, table_values, counts, points, least):  # type: ignore
     return number
 
 
+@kernel
+def blocks_of(points):  # type: ignore[no-untyped-def]
+    """Keys of the blocks that points (M, N, 3) ticks lie in, ascending."""
+    keys, count = np.empty(points.shape[0] * points.shape[1], np.int64), 0
+    for m in range(points.shape[0]):
+        for n in range(points.shape[1]):
+            x, y, z = points[m, n]
+            keys[count] = pack(x >> IN_BLOCK, y >> IN_BLOCK, z >> IN_BLOCK)
+            if count == 0 or keys[count] != keys[count - 1]:
+                count += 1
+    return np.unique(keys[:count])
+
+
 class FreeSpace:
     """Beam counts by cell of 4 voxels, in dense blocks of 8^3 cells."""
 
@@ -135,7 +153,8 @@ class FreeSpace:
         self._keys = np.zeros(FIRST_BLOCKS, np.int64)
         self._counts = self._memory.grown(np.zeros((0, 512), np.int32), 0, FIRST_BLOCKS)
         self._table = rehash(self._keys, 0, 4 * FIRST_BLOCKS)
-        self.num_blocks = 0
+        self._passed = np.zeros(FIRST_BLOCKS, np.int64)  # when a block was passed last
+        self.num_blocks, self.now = 0, 1
 
     def freeze(self) -> tuple[Int64Array, NDArray[np.int32]]:
         """Copies of block keys (B,) and their cells' counts (B, 512)."""
@@ -147,11 +166,18 @@ class FreeSpace:
         if counts.shape != (len(keys), 512) or len(np.unique(keys)) < len(keys):
             raise ValueError(f"{counts.shape} cells for {len(keys)} blocks of free space")
         capacity = max(FIRST_BLOCKS, len(keys))
-        self._keys = np.zeros(capacity, np.int64)
+        self._keys, self._passed = np.zeros((2, capacity), np.int64)
         self._counts = self._memory.grown(self._counts, 0, capacity)
         self._keys[: len(keys)], self._counts[: len(keys)] = keys, counts
         self._table = rehash(self._keys, len(keys), 4 << (capacity - 1).bit_length())
-        self.num_blocks = len(keys)
+        self.num_blocks, self._passed[: len(keys)] = len(keys), self.now
+
+    def passed_since(self, then: int) -> list[int]:
+        """Keys of the blocks that a beam passed, or was taken out of, after the time `then`. Each
+        call begins a new `now`."""
+        self.now += 1
+        lately = np.flatnonzero(self._passed[: self.num_blocks] > then)
+        return [int(key) for key in self._keys[lately]]
 
     def insert(self, ticks: Ticks) -> None:
         """Count the beams of scans."""
@@ -175,24 +201,25 @@ class FreeSpace:
         return keys[order], self._counts[block, local][order]
 
     def _apply(self, ticks: Ticks, sign: int) -> None:
-        scans = ticks.sensors, ticks.pose_hashes
+        scans, passed = (ticks.sensors, ticks.pose_hashes), (self._passed, self.now)
         hits, empty = (ticks.points, ticks.starts, True), (ticks.beams, ticks.beam_starts, False)
         for points, starts, ends in (hits, empty):
             done = 0
             while done < len(points):
                 done, self.num_blocks = _pass_all(
-                    self._table, self._counts, self._keys, self.num_blocks, scans,
+                    self._table, self._counts, self._keys, passed, self.num_blocks, scans,
                     points, starts, done, sign, ends,
                 )  # fmt: skip
                 if done < len(points):
                     self._grow()
+                    passed = self._passed, self.now
 
     def _grow(self) -> None:
         capacity = 2 * len(self._keys)
-        keys = np.zeros(capacity, np.int64)
-        keys[: len(self._keys)] = self._keys
-        self._keys, self._counts = keys, self._memory.grown(self._counts, self.num_blocks, capacity)
-        self._table = rehash(keys, self.num_blocks, 4 << (capacity - 1).bit_length())
+        self._keys = np.concatenate([self._keys, np.zeros_like(self._keys)])
+        self._passed = np.concatenate([self._passed, np.zeros_like(self._passed)])
+        self._counts = self._memory.grown(self._counts, self.num_blocks, capacity)
+        self._table = rehash(self._keys, self.num_blocks, 4 << (capacity - 1).bit_length())
 
 
 @kernel(allocates=False)

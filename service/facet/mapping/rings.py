@@ -169,14 +169,17 @@ def _turn(path, vertex, edges, num):  # type: ignore[no-untyped-def]
 def _in_order(edges):  # type: ignore[no-untyped-def]
     """Edges (E, 4) by where they start, then by where they stop, each once."""
     start, stop = _keys(edges)
-    order = np.argsort(stop, kind="mergesort")
-    order = order[np.argsort(start[order], kind="mergesort")]
-    kept, count = np.empty(order.shape[0], np.int64), 0
-    for e in order:
-        last = kept[count - 1] if count else e
-        if count == 0 or start[e] != start[last] or stop[e] != stop[last]:
-            kept[count] = e
-            count += 1
+    kept, count = np.empty(start.shape[0], np.int64), 0
+    for e in np.argsort(start, kind="mergesort"):
+        at = count  # among the few that start there
+        while at > 0 and start[kept[at - 1]] == start[e] and stop[kept[at - 1]] > stop[e]:
+            at -= 1
+        if at > 0 and start[kept[at - 1]] == start[e] and stop[kept[at - 1]] == stop[e]:
+            continue
+        for n in range(count, at, -1):
+            kept[n] = kept[n - 1]
+        kept[at] = e
+        count += 1
     return edges[kept[:count]]
 
 

@@ -137,8 +137,9 @@ class TileField:
             tile = self.tiles[key]
             out = np.empty(len(tile.rows), np.int64)
             count = list_abroad(store.blocks, key, tile.rows, tile.state, tile.runs, tile.ids, out)
-            lie_in.append(np.setxor1d(out[:count], tile.abroad, assume_unique=True) >> 32)
-            tile.abroad = out[:count].copy()
+            if not np.array_equal(out[:count], tile.abroad):
+                lie_in.append(np.setxor1d(out[:count], tile.abroad, assume_unique=True) >> 32)
+                tile.abroad = out[:count].copy()
         rows = np.concatenate([np.zeros(0, np.int64), *lie_in])
         return set(tile_keys_of(store.blocks.keys[store.columns.block[rows]]).tolist())
 
