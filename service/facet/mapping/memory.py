@@ -19,6 +19,7 @@ Column = NDArray[Any]
 CHUNK = 1 << 20  # bytes that are looked at at a time
 SMALL = 4 << 20  # bytes: two large pages
 LARGE_PAGES = "MADV_HUGEPAGE"  # fewer of them are looked up
+RESERVE, MOST = 16, 1 << 30  # how many times what it needs a column is promised, and bytes of that
 C = TypeVar("C", bound=tuple[Any, ...])
 
 
@@ -41,8 +42,14 @@ class Heap:
     growth = 4  # a copy is dearer than room that is not used
 
     def grown(self, column: Column, used: int, capacity: int) -> Column:
-        """A copy, see `Memory`."""
-        out = _promised((capacity, *column.shape[1:]), column.dtype)
+        """The same memory where it was promised more, else a copy, see `Memory`: to copy a million
+        voxels takes as long as some updates."""
+        shape, own = (capacity, *column.shape[1:]), _room_of(column)
+        count = math.prod(shape)
+        if used and own is not None and own.nbytes >= count * column.itemsize:
+            clear(column[used:])
+            return np.frombuffer(own, column.dtype, count).reshape(shape)
+        out = _promised(shape, column.dtype)
         for part in _written(column[:used]):  # a copy of zeros would take memory
             out[part] = column[part]
         return out
@@ -65,12 +72,25 @@ def sparse(count: int, dtype: DTypeLike) -> Column:
     return _mapped(count, np.dtype(dtype), "MADV_NOHUGEPAGE")
 
 
+def _room_of(column: Column) -> memoryview | None:
+    """All that was mapped for a column; None for one in other memory."""
+    base: Any = column
+    while isinstance(base, np.ndarray):
+        base = base.base
+    is_mapped = isinstance(base, memoryview) and isinstance(base.obj, mmap.mmap)
+    return base if is_mapped else None
+
+
 def _promised(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Column:
     """Zeros that take no memory until they are written. `np.zeros` writes them where it is given
     memory that was in use before."""
     count = math.prod(shape)
-    if count * dtype.itemsize < SMALL:
+    num_bytes = count * dtype.itemsize
+    if num_bytes < SMALL:
         return np.zeros(shape, dtype)
+    with suppress(OSError):  # from a system that promises no more than it has
+        reserve = max(1, min(RESERVE, MOST // num_bytes))
+        return _mapped(reserve * count, dtype, LARGE_PAGES)[:count].reshape(shape)
     return _mapped(count, dtype, LARGE_PAGES).reshape(shape)
 
 
