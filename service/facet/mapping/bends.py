@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from facet.mapping.blocks import unpack_all
+from facet.mapping.claims import is_own
 from facet.mapping.eigen import eigenvector, smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.merging import Nodes
@@ -45,7 +46,7 @@ GAP_WIDTH = 4.0  # voxels: a narrower strip has no place for that
 @kernel(allocates=False)
 def _is_pure(normals, patches, row):  # type: ignore[no-untyped-def]
     """Whether a voxel has a normal that no other surface turned."""
-    return patches.member[row] >= 0 and not normals.border[row] and patches.second[row] < 0
+    return patches.member[row] >= 0 and is_own(normals.border, patches.second, row)
 
 
 @kernel

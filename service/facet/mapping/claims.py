@@ -78,6 +78,13 @@ CLAIMS = np.dtype(  # scratch of one thread: patches that may claim the voxels o
 
 
 @kernel(allocates=False)
+def is_own(border, second, row):  # type: ignore[no-untyped-def]
+    """Whether a voxel holds no points of another surface: it lies at no border (V,), and no plane
+    at an angle claims it, second (V,)."""
+    return not (border[row] or second[row] >= 0)
+
+
+@kernel(allocates=False)
 def _list(blocks, observable, member, block, with_empty, found):  # type: ignore[no-untyped-def]
     """List the voxels of a block, those that are empty now too if `with_empty`. How many."""
     if with_empty:

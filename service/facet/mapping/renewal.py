@@ -18,9 +18,11 @@ from facet.mapping.merging import Nodes
 from facet.mapping.runs import deal, starts_of
 from facet.mapping.store import Touched
 from facet.mapping.sums import MOMENTS, SUMS
-from facet.mapping.tally import Tally, tally_points
+from facet.mapping.tally import Tally, catch_up, tally_points
 from facet.mapping.tile import Tile
 
+News = tuple[NDArray[np.uint16], NDArray[np.int64]]  # place (V,) of a voxel among the touched, plus
+# 1, and what the sums of these were
 _NOTHING = np.zeros((0, SUMS), np.int64)
 
 
@@ -34,6 +36,7 @@ class Renewal:
     def renew(
         self,
         tiles: list[Tile],
+        seen: list[Tile],
         into: dict[int, NDArray[np.int16]],
         changed: set[int],
         sources: tuple[Any, ...],
@@ -44,11 +47,33 @@ class Renewal:
     ) -> None:
         """Find the members of the tile-planes of tiles, what these inherit, and sum their points.
 
-        into: by tile key what its old tile-planes became, where they are new; changed: keys of
-        those where voxels may be on other tile-planes; sources: (blocks, columns, border,
-        second)."""
-        if not tiles:
-            return
+        seen: other tiles, where nothing but the points of their members can have changed; into: by
+        tile key what its old tile-planes became, where they are new; changed: keys of those where
+        voxels may be on other tile-planes; sources: (blocks, columns, border, second)."""
+        news = self._tell(touched, len(sources[1].block))
+        if touched.before is None:
+            tiles, seen = sorted(tiles + seen, key=lambda tile: tile.key), []
+        if seen:
+            _catch_up(seen, sources, flags, news)
+        if tiles:
+            self._renew(
+                tiles, into, changed, sources, patches, plane_of_patch, flags, news,
+                touched.before is None,
+            )  # fmt: skip
+        self._news[touched.rows] = 0
+
+    def _renew(
+        self,
+        tiles: list[Tile],
+        into: dict[int, NDArray[np.int16]],
+        changed: set[int],
+        sources: tuple[Any, ...],
+        patches: Any,
+        plane_of_patch: NDArray[np.int16],
+        flags: NDArray[np.uint8],
+        news: News,
+        anew: bool,
+    ) -> None:
         blocks, columns = sources[:2]
         tile_keys = np.array([tile.key for tile in tiles], np.int64)
         became = [into[t.key] if t.key in into else _as_before(t) for t in tiles]
@@ -75,10 +100,8 @@ class Renewal:
         spans = np.stack([starts_of(old), starts_of(new)], axis=1)
         tally_points(
             *sources, flags, nodes, tile_keys, parts, before, held, spans, all_into,
-            *self._tell(touched, len(columns.block)), touched.before is None, was, tally, same,
-            origin,
+            *news, anew, was, tally, same, origin,
         )  # fmt: skip
-        self._news[touched.rows] = 0
         stamps = self._stamps(tiles, same, origin)
         starts = starts_of(new).tolist()
         for n, (tile, low, high) in enumerate(zip(tiles, starts, starts[1:], strict=False)):
@@ -87,9 +110,7 @@ class Renewal:
                 _bequeath(tile, own)
             _give(tile, held, n, stamps, tally, slice(low, high))
 
-    def _tell(
-        self, touched: Touched, capacity: int
-    ) -> tuple[NDArray[np.uint16], NDArray[np.int64]]:
+    def _tell(self, touched: Touched, capacity: int) -> News:
         """Where the touched voxels are found among their sums before, and these."""
         if len(self._news) < capacity:
             self._news = np.zeros(capacity, np.uint16)
@@ -106,6 +127,15 @@ class Renewal:
         self._stamp += len(same)
         stamps[same] = np.concatenate([tile.stamps for tile in tiles])[origin[same]]
         return stamps
+
+
+def _catch_up(tiles: list[Tile], sources: Any, flags: NDArray[np.uint8], news: News) -> None:
+    """Add what came to the members of tiles."""
+    tally, keys = _tallied(tiles), np.array([tile.key for tile in tiles], np.int64)
+    starts = starts_of([tile.num_planes for tile in tiles])
+    catch_up(*sources[:2], flags, keys, _held(tiles), starts, *news, tally)
+    for tile, low, high in zip(tiles, starts.tolist(), starts[1:].tolist(), strict=False):
+        tile.points, tile.total = tally.points[low:high].copy(), tally.total[low:high].copy()
 
 
 def _as_before(tile: Tile) -> NDArray[np.int16]:

@@ -12,6 +12,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from facet.mapping.blocks import CENTRE, Blocks, list_voxels
+from facet.mapping.claims import is_own
 from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.runs import SHARES, dealt
@@ -37,7 +38,7 @@ def _list_members(blocks, border, patches, block, members):  # type: ignore[no-u
         row = rows[v]
         label = np.int64(patches.label[row])
         rows[count], places[count], owners[count] = row, places[v], label & 15
-        are_pure[count] = not border[row] and patches.second[row] < 0
+        are_pure[count] = is_own(border, patches.second, row)
         count += label >> 4 == CENTRE
     return count
 

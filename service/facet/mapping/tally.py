@@ -9,6 +9,7 @@ from numba import prange
 from numpy.typing import NDArray
 
 from facet.mapping.blocks import unpack
+from facet.mapping.claims import is_own
 from facet.mapping.eigen import smallest
 from facet.mapping.kernel import kernel
 from facet.mapping.membership import CLAIMED, LOOK, MIXED, MOVED, NEW, OTHER, PURE, TOUCHED
@@ -61,7 +62,7 @@ def _sound(sources, held, span, tile_key):  # type: ignore[no-untyped-def]
         corner = _corner(blocks, held.block[r], tile_key)
         for m in range(held.start[r], held.start[r] + held.size[r]):
             row = held.rows[m]
-            if held.state[m] == CLAIMED or border[row] or second[row] >= 0:
+            if held.state[m] == CLAIMED or not is_own(border, second, row):
                 continue
             local, seen = np.int64(columns.local[row]), columns.observable[row]
             out[count, 0] = STEPS * (corner[0] + (local & 7)) + (seen & 15)
@@ -146,12 +147,6 @@ def _is_slim(facing):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def _is_own(border, second, row):  # type: ignore[no-untyped-def]
-    """Whether a voxel holds no points of another surface."""
-    return not (border[row] or second[row] >= 0)
-
-
-@kernel(allocates=False)
 def _look(sources, held, r, corner, plane, slim, tally, t, sums, fresh):  # type: ignore[no-untyped-def]
     """Find what the members of a run are to their tile-plane, `slim` or not, and change its PURE
     points by it: add them, where they are `fresh`. Sets the margin."""
@@ -162,7 +157,7 @@ def _look(sources, held, r, corner, plane, slim, tally, t, sums, fresh):  # type
             continue
         row = held.rows[m]
         now = MIXED
-        if slim or _is_own(border, second, row):
+        if slim or is_own(border, second, row):
             local, seen = np.int64(columns.local[row]), columns.observable[row]
             off = (
                 plane[0] * (corner[0] + (local & 7) + (seen & 15) / STEPS)
@@ -246,6 +241,19 @@ def _catch_up(sources, before, r, corner, news, tally, t, sums):  # type: ignore
         tally.total[t] += sums[0]
         if before.state[m] == PURE:
             _shift(columns, before.rows[m], corner, sums, tally.points[t])
+
+
+@kernel
+def catch_up(blocks, columns, flags, tile_keys, before, first, place, earlier, tally):  # type: ignore[no-untyped-def]
+    """Add what came to the voxels of tiles (N,), whose members are as `before`, to the sums of
+    their tile-planes, those of tile n from first[n] on; place, earlier: see `tally_points`."""
+    sources, sums = (blocks, columns), np.empty(SUMS, np.int64)
+    for n in range(tile_keys.shape[0]):
+        for r in range(before.first[n], before.last[n]):
+            if flags[before.block[r]] & TOUCHED:
+                corner = _corner(blocks, before.block[r], tile_keys[n])
+                t = first[n] + before.plane[r]
+                _catch_up(sources, before, r, corner, (place, earlier), tally, t, sums)
 
 
 @kernel

@@ -102,11 +102,12 @@ class TileField:
         changed = sorted(self._near(keys[others], np.array(regroup, np.int64)))
         near = self._near(keys[seen])
         stirred = {*changed, *self._near(keys[turned])}
-        tiles = [self.tiles[key] for key in sorted(stirred | near)]
+        renewed, only_seen = ([self.tiles[k] for k in sorted(t)] for t in (stirred, near - stirred))
         sources = store.blocks, store.columns, normals.border, patches.patches.second
         self._renewal.renew(
-            tiles, into, set(changed), sources, patches.patches, self.plane_of_patch, flags, touched
-        )
+            renewed, only_seen, into, set(changed), sources, patches.patches, self.plane_of_patch,
+            flags, touched,
+        )  # fmt: skip
         self._pair(store, patches, sorted(self._near(keys[replaced])))
         return regroup, changed, stirred
 
