@@ -15,7 +15,7 @@ import pytest
 from numpy.typing import NDArray
 
 from facet.mapping.mapper import Mapper
-from facet.mapping.memory import RESERVE, SMALL, Heap
+from facet.mapping.memory import SMALL, Heap
 from facet_protocol.messages import Scan
 from mapping_logs import log
 
@@ -103,13 +103,14 @@ def test_the_same_loop_again_and_again_grows_nothing() -> None:
 
 def test_a_large_column_grows_where_it_is() -> None:
     """To copy it would hold up an update; what is behind it is zero, whatever was there."""
-    first = Heap().grown(np.zeros(0, np.int64), 0, SMALL // 8)
+    memory = Heap(reserve=16)
+    first = memory.grown(np.zeros(0, np.int64), 0, SMALL // 8)
     first[:] = 7
-    grown = Heap().grown(first, len(first) - 9, 4 * len(first))
+    grown = memory.grown(first, len(first) - 9, 4 * len(first))
     assert np.shares_memory(first, grown)
     assert grown[: len(first) - 9].all()
     assert not grown[len(first) - 9 :].any()
-    copy = Heap().grown(grown, len(first) - 9, RESERVE * len(first) + 1)
+    copy = memory.grown(grown, len(first) - 9, 16 * len(first) + 1)
     assert not np.shares_memory(grown, copy)
     assert np.array_equal(copy[: len(grown)], grown)
     assert not copy[len(grown) :].any()

@@ -14,7 +14,7 @@ from facet.config import NetworkSection
 from facet.session import client_settings, open_session, service_settings
 from facet.sources.live import Inbox, LiveSource
 from facet.sources.recovery import GIVE_UP_S, MAX_ASKED, MAX_GAPS, MAX_MISSING, Recovery
-from rig import free_endpoint, patient, room, wait_until
+from rig import free_endpoint, patient, room, wait_for_ear, wait_until
 from tcp_proxy import Proxy
 
 KEY = "facet/v1/map/robot/r1/scan/front"
@@ -70,6 +70,20 @@ def test_an_answer_that_breaks_off_is_asked_for_again() -> None:
         wait_until(lambda: not recovery.num_missing)
     assert cache.asked == [(2, 9), (5, 9), (8, 9)]
     assert taken == [2, 3, 4, 5, 6, 7, 8, 9]
+
+
+def test_what_came_before_the_first_is_asked_for_where_it_is_lacking() -> None:
+    """Of a publisher that was heard before a restart; the others' first is their beginning."""
+    cache = Cache([3, 4, 5, 6])
+    with recovering(cache, lacking=lambda first: 4) as (recovery, taken):
+        noted(recovery, 7, 8)
+        wait_until(lambda: not recovery.num_missing)
+    assert cache.asked == [(3, 6)]
+    assert taken == [3, 4, 5, 6]
+    with recovering(Cache([0, 1]), lacking=lambda first: 9) as (recovery, taken):
+        noted(recovery, 2)
+        wait_until(lambda: not recovery.num_missing)
+    assert taken == [0, 1]
 
 
 def test_nobody_answers_at_first() -> None:
@@ -181,3 +195,37 @@ def test_a_link_that_breaks_over_the_answer_costs_nothing() -> None:
             publisher.close()
         source.close()
     assert len(numbers) == 102  # each of them once
+
+
+def test_a_service_that_begins_again_asks_for_what_it_missed() -> None:
+    """Of a robot that went on meanwhile, as long as its publisher keeps it."""
+    endpoint = free_endpoint()
+    network = NetworkSection(listen=(endpoint,), shared_memory=False)
+    settings = patient(client_settings(endpoint, shared_memory=False))
+    with open_session(service_settings(network)) as service, open_session(settings) as robot:
+        publisher, inbox = RobotPublisher(robot, "map"), Inbox(1000, 1 << 30)
+        source = LiveSource(service, "map", inbox)
+        wait_for_ear(robot, KEY)
+
+        def until(last: int) -> list[int]:
+            numbers: list[int] = []
+
+            def all_there() -> bool:
+                numbers.extend(e.sequence for e in inbox.take(1 << 30))
+                return last in numbers
+
+            wait_until(all_there)
+            return numbers
+
+        for _ in range(3):
+            publisher.publish("r1", "front", SCAN)
+        assert until(3) == [1, 2, 3]
+        source.close()
+        for _ in range(7):
+            publisher.publish("r1", "front", SCAN)
+        source = LiveSource(service, "map", inbox, newest={"r1/front": (publisher.epoch, 3)})
+        wait_for_ear(robot, KEY)
+        publisher.publish("r1", "front", SCAN)
+        assert sorted({11, *until(10)}) == [*range(4, 12)]
+        source.close()
+        publisher.close()

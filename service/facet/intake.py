@@ -121,9 +121,11 @@ class Intake:
         self._shed: Counter[tuple[str, int]] = Counter()  # by source and epoch
         self._derived: deque[Addressed | threading.Event] = deque()
         self._said: list[Addressed] = []  # written, not yet durable: for the follower
+        self._failure = ""  # why the log is not being written
         self._took_s = 0.0  # the last commit
         self._is_asked = False  # for scans, before they are due
         self._is_finished = False  # the log is whole, and nothing more comes
+        self._has_ended = False  # nothing more is written, whole or not
         self._awaited: list[threading.Event] = []  # set when what was taken is durable
         self._scans: list[Envelope] = []  # written, not yet durable
         self._stopping = threading.Event()
@@ -167,8 +169,8 @@ class Intake:
 
     def is_logged(self, timeout_s: float) -> bool:
         """Whether all that `write` has taken by now is durable, or is after so long."""
-        if self._is_finished:
-            return not self._derived
+        if self._has_ended:
+            return self._is_finished and not self._derived
         logged = threading.Event()
         self._derived.append(logged)
         return logged.wait(timeout_s)
@@ -183,8 +185,8 @@ class Intake:
     def drain(self, timeout_s: float) -> None:
         """Wait until what has come in is durable and handed on, or the time is up."""
         deadline = time.monotonic() + timeout_s
-        while (len(self._inbox) or self._scans) and time.monotonic() < deadline:
-            time.sleep(0.005)
+        while self.catch_up(max(0.0, deadline - time.monotonic())) and len(self._inbox):
+            pass
 
     def stop(self, timeout_s: float) -> None:
         """Record what is left and finish the file."""
@@ -199,6 +201,7 @@ class Intake:
             logger.exception("the recorder failed")
             self._account.failure = f"recorder: {error}"
             self.failed.set()
+        self._has_ended = True
 
     def _record_until_stopped(self) -> None:
         due = time.monotonic() + self._commit_s
@@ -208,14 +211,16 @@ class Intake:
                 self._is_asked, is_due = False, True
             if not is_due and self._took_s > HURRY_S:
                 continue
-            if is_due and not self._account.failure and self._durable.wait_for_room(self._commit_s):
+            if is_due and not self._failure and self._durable.wait_for_room(self._commit_s):
                 self._take()
-            if not self._account.failure:
+            if not self._failure:
                 self._take_own()
             self._commit()
             if is_due:
                 due = time.monotonic() + self._commit_s
         self._take()
+        while len(self._inbox):  # more than one commit takes
+            self._take()
         self._take_own()
         self._finish()
 
@@ -300,9 +305,11 @@ class Intake:
         except OSError as error:
             self._fail(error)
             return
-        if self._account.failure:
+        if self._failure:
             logger.warning("the log is being written again")
-            self._account.failure = ""
+            if self._account.failure == self._failure:  # not another thread's
+                self._account.failure = ""
+            self._failure = ""
         self._took_s = time.monotonic() - started
         if self._scans:
             self._account.gauge("commit_ms", self._took_s * 1e3)
@@ -343,7 +350,7 @@ class Intake:
             self._past.define(path, partial(definitions_of, position.channels))
 
     def _fail(self, error: OSError) -> None:
-        self._account.failure = str(error)
+        self._failure = self._account.failure = str(error)
         self._account.count("recorder_failed")
         logger.error("the log cannot be written, nothing is mapped: %s", error)
         if self._exit_on_failure:

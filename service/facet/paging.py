@@ -8,9 +8,11 @@ from __future__ import annotations
 import logging
 import mmap
 import os
+import resource
 import tempfile
 import threading
 import weakref
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,6 +24,8 @@ from facet.mapping.memory import Column, Heap, clear
 
 logger = logging.getLogger(__name__)
 
+RESERVE = 16  # times what it needs, that a column is promised where that costs nothing
+STRICT = "2"  # vm.overcommit_memory: promises are counted
 SMALLEST = 1 << 18  # bytes: smaller columns stay in plain memory
 MIB = 1 << 20
 
@@ -30,6 +34,16 @@ def resident_bytes() -> int:
     """Memory of this process that is not on the disk alone."""
     with open("/proc/self/statm", encoding="ascii") as file:
         return int(file.read().split()[1]) * mmap.PAGESIZE
+
+
+def plain_memory() -> Heap:
+    """Plain memory, in which large columns grow where they are, unless the system counts what it
+    promises: a limit of addresses, or strict accounting."""
+    is_counted = resource.getrlimit(resource.RLIMIT_AS)[0] != resource.RLIM_INFINITY
+    with suppress(OSError):
+        policy = Path("/proc/sys/vm/overcommit_memory").read_text(encoding="ascii")
+        is_counted |= policy.strip() == STRICT
+    return Heap(1 if is_counted else RESERVE)
 
 
 @dataclass(slots=True)

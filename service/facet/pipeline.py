@@ -145,11 +145,11 @@ class Pipeline:
                 continue
             points = self._exchange(old, new)
             self._account.settle(new.source, "scans_corrected", 0, {"scans_corrected": 1, **points})
-        if moved.scans:
+        self.is_stale |= bool(moved.scans)
+        if not moved.corrected.reason:  # one that was refused is counted as that
             is_erasure = topics.is_erase_topic(moved.envelope.key)
             outcome = "used_as_erasure" if is_erasure else "used_as_correction"
             self._account.settle(source_of(moved.envelope), outcome)
-            self.is_stale = True
 
     def _erase(self, scan: Scan) -> None:
         """Take a scan out, exactly. It was applied; its points are none of the map's any more."""

@@ -148,9 +148,9 @@ class Service:
         self._intake.start()
         self._mapping.start()
         self._reporting.start()
-        robots = self._config.robots
+        named, robots = self._config.map.id, self._config.robots
         self._source = LiveSource(
-            self._session, self._config.map.id, self._inbox, dialects_of(robots), robots.keys
+            self._session, named, self._inbox, dialects_of(robots), robots.keys, self._newest
         )
 
     def _admit(self) -> Admission:
@@ -193,6 +193,8 @@ class Service:
         self._reporting.join(1.0)
         self._say_status()
         self._intake.stop(JOIN_S)
+        if not self._mapping.is_alive():  # what became durable too late for the mapper
+            _leave_out(self.account, self._durable.take(0.0))
         self._answers.close()
         self._publisher.close()
         if self._mapping.is_alive() or self.fault is not None:
@@ -213,8 +215,7 @@ class Service:
                 self._step(timeout_s=0.1)
             self._step(timeout_s=0.0)
             self._pipeline.finish(max(0.0, self._stop_at - time.monotonic()))
-            for envelope in self._admission.corrections.waiting():
-                self.account.settle(source_of(envelope), "not_applied")
+            _leave_out(self.account, self._admission.corrections.waiting())
         except Exception as error:  # a fault of ours: nothing after it could be trusted
             logger.exception("the mapper failed")
             self.fault = error
@@ -257,8 +258,7 @@ class Service:
                 note_newest(self._newest, envelope)
             self._pipeline.insert(*now)
             num += len(now)
-        for envelope in taken[num:]:
-            self.account.settle(source_of(envelope), "not_applied")
+        _leave_out(self.account, taken[num:])
         if taken and num == len(taken):
             self._position = self._durable.taken_to
 
@@ -272,8 +272,10 @@ class Service:
     def _do(self, task: Task) -> None:
         try:
             task.result.set_result(task.run())
-        except Exception as error:  # noqa: BLE001 it is the asker's to handle
+        except Exception as error:
             task.result.set_exception(error)
+            if not isinstance(error, CommandError):  # a fault of ours, as in any other step
+                raise
 
     def _report(self) -> None:
         """The status thread: one message a period."""
@@ -357,12 +359,20 @@ class Service:
 
     def _on_mapper(self, run: Callable[[], Any]) -> Any:
         """The result of `run`, on the thread that owns the map, between two updates."""
+        if self.fault is not None:
+            raise CommandError(f"the mapper failed: {self.fault}")
         task = Task(run, Future())
         self._tasks.put(task)
         try:
             return task.result.result(timeout=ANSWER_S)
         except TimeoutError:
             raise CommandError("the mapper is busy: ask again") from None
+
+
+def _leave_out(account: Account, envelopes: list[Envelope]) -> None:
+    """They are in the log, and not in the map."""
+    for envelope in envelopes:
+        account.settle(source_of(envelope), "not_applied")
 
 
 def _recorder(config: Config, mapper: Mapper) -> Recorder:

@@ -212,7 +212,8 @@ def _conclude(service: Service, model: Model | None) -> Exit:
     """The last word: what was recorded, what was lost."""
     account = service.account
     received, recorded = account["received"], account["recorded"]
-    lost = received - recorded + account["lost_upstream"]
+    left_out = account["not_applied"]
+    lost = received - recorded + account["lost_upstream"] + left_out
     share = 100.0 * recorded / received if received else 100.0
     table("counters", ("counter", "value"), account.counters().items())
     for path in service.recorder.paths:
@@ -221,6 +222,8 @@ def _conclude(service: Service, model: Model | None) -> Exit:
         f"recorded {recorded:,} of {received:,} received ({share:.1f} %), "
         f"lost upstream {account['lost_upstream']:,}"
     )
+    if left_out:
+        out.print(f"{left_out:,} of them came too late for the model: facet replay maps them")
     if service.fault is not None:
         return Exit.FAULT
     if account.failure:

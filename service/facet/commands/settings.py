@@ -15,8 +15,8 @@ from facet.config import Config, ConfigError
 
 if TYPE_CHECKING:
     from facet.mapping.mapper import Mapper
+    from facet.mapping.memory import Memory
     from facet.mapping.settings import MapSettings
-    from facet.paging import PagedMemory
 
 logger = logging.getLogger(__name__)
 
@@ -91,12 +91,14 @@ def load_loops(settings: MapSettings, say: Callable[[str], object] = err.print) 
         warm_up(settings)
 
 
-def _memory(config: Config) -> PagedMemory | None:
-    """Room for the map's columns; None: plain memory."""
-    from facet.paging import MIB, PagedMemory
+def _memory(config: Config) -> Memory:
+    """Room for the map's columns."""
+    from facet.paging import MIB, PagedMemory, plain_memory
 
     limit = config.memory.max_ram_mb
-    return PagedMemory(config.record.directory, limit * MIB) if limit is not None else None
+    if limit is None:
+        return plain_memory()
+    return PagedMemory(config.record.directory, limit * MIB)
 
 
 def recorded_settings(head: Mapping[str, str]) -> dict[str, Any]:

@@ -19,7 +19,7 @@ Column = NDArray[Any]
 CHUNK = 1 << 20  # bytes that are looked at at a time
 SMALL = 4 << 20  # bytes: two large pages
 LARGE_PAGES = "MADV_HUGEPAGE"  # fewer of them are looked up
-RESERVE, MOST = 16, 1 << 30  # how many times what it needs a column is promised, and bytes of that
+MOST = 1 << 30  # bytes that a column is promised beyond what it needs
 C = TypeVar("C", bound=tuple[Any, ...])
 
 
@@ -37,9 +37,15 @@ class Memory(Protocol):
 
 
 class Heap:
-    """Plain memory. What was not written yet takes none."""
+    """Plain memory. What was not written yet takes none.
+
+    Large columns are promised `reserve` times what they need: then they grow where they are. Where
+    promises are counted, that is better 1."""
 
     growth = 4  # a copy is dearer than room that is not used
+
+    def __init__(self, reserve: int = 1) -> None:
+        self._reserve = reserve
 
     def grown(self, column: Column, used: int, capacity: int) -> Column:
         """The same memory where it was promised more, else a copy, see `Memory`: to copy a million
@@ -49,7 +55,7 @@ class Heap:
         if used and own is not None and own.nbytes >= count * column.itemsize:
             clear(column[used:])
             return np.frombuffer(own, column.dtype, count).reshape(shape)
-        out = _promised(shape, column.dtype)
+        out = _promised(shape, column.dtype, self._reserve)
         for part in _written(column[:used]):  # a copy of zeros would take memory
             out[part] = column[part]
         return out
@@ -81,7 +87,7 @@ def _room_of(column: Column) -> memoryview | None:
     return base if is_mapped else None
 
 
-def _promised(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Column:
+def _promised(shape: tuple[int, ...], dtype: np.dtype[Any], reserve: int) -> Column:
     """Zeros that take no memory until they are written. `np.zeros` writes them where it is given
     memory that was in use before."""
     count = math.prod(shape)
@@ -89,8 +95,8 @@ def _promised(shape: tuple[int, ...], dtype: np.dtype[Any]) -> Column:
     if num_bytes < SMALL:
         return np.zeros(shape, dtype)
     with suppress(OSError):  # from a system that promises no more than it has
-        reserve = max(1, min(RESERVE, MOST // num_bytes))
-        return _mapped(reserve * count, dtype, LARGE_PAGES)[:count].reshape(shape)
+        times = max(1, min(reserve, MOST // num_bytes))
+        return _mapped(times * count, dtype, LARGE_PAGES)[:count].reshape(shape)
     return _mapped(count, dtype, LARGE_PAGES).reshape(shape)
 
 

@@ -107,6 +107,10 @@ class Answers:
             except CommandError as error:
                 _refuse(query, str(error))
                 return
+            except Exception as error:  # a full disk, a folder in the way: the asker is told
+                logger.exception("%s failed", name)
+                _refuse(query, f"{name} failed: {error}")
+                return
             query.reply(key, json.dumps(result), encoding=zenoh.Encoding.APPLICATION_JSON)
 
         return answer

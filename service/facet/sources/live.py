@@ -6,7 +6,7 @@ import ctypes
 import threading
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -187,7 +187,8 @@ class Inbox:
 class LiveSource:
     """Subscribes to every scan, pose and correction of a map's robots, whatever they speak.
 
-    What a stall made us miss on Facet's own keys is asked for again, until it comes; static
+    What a stall made us miss on Facet's own keys is asked for again, until it comes; so is what was
+    sent since the log ended, whose `newest` (epoch, sequence) by source these are. Static
     transforms are asked for when we come late. `keys` are the foreign keys that are listened to:
     what is recognised there by the dialect table is taken, the rest is left alone.
     """
@@ -199,12 +200,13 @@ class LiveSource:
         inbox: Inbox,
         dialects: Dialects | None = None,
         keys: Sequence[str] = (),
+        newest: Mapping[str, tuple[int, int]] | None = None,
     ) -> None:
-        self._session, self._inbox = session, inbox
+        self._session, self._inbox, self._newest = session, inbox, dict(newest or {})
         self._dialects = dialects or Dialects()
         self._patterns = [key_pattern(key) for key in keys]
         static = poses_keys(map_id, static=True)
-        self._recovery = Recovery(asked_in(session), self._push_native)
+        self._recovery = Recovery(asked_in(session), self._push_native, lacking=self._lacking)
         self._recovery.start()
         self._closers: list[Callable[[], object]] = [self._recovery.close]
         for key in (scans_key(map_id), corrections_key(map_id), *poses_keys(map_id), *static):
@@ -250,6 +252,15 @@ class LiveSource:
         _keep_thread_state()
         self._recovery.note(sample)
         self._push_native(sample)
+
+    def _lacking(self, sample: zenoh.Sample) -> int:
+        """How many samples lie between what the log ends with and the first that came since."""
+        epoch, newest = self._newest.get(source_of(str(sample.key_expr)), (0, 0))
+        try:
+            mark = attachment.unpack(sample.attachment.to_bytes() if sample.attachment else b"")
+        except ProtocolError:
+            return 0
+        return max(0, mark.sequence - newest - 1) if mark.epoch == epoch else 0
 
     def _push_native(self, sample: zenoh.Sample) -> None:
         self._inbox.push(sample, self._dialects.recognise(*_names(sample)))

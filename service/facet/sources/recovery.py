@@ -67,8 +67,10 @@ class Recovery:
         ask: Ask,
         take: Callable[[zenoh.Sample], None],
         clock: Callable[[], float] = time.monotonic,
+        lacking: Callable[[zenoh.Sample], int] = lambda sample: 0,
     ) -> None:
-        self._ask, self._take, self._clock = ask, take, clock
+        """`lacking`: how many samples before the first of a publisher have not come either."""
+        self._ask, self._take, self._clock, self._lacking = ask, take, clock, lacking
         self._newest: dict[Publisher, int] = {}
         self._gaps: list[Gap] = []
         self._changed = threading.Condition()
@@ -100,7 +102,9 @@ class Recovery:
         source, number = info.source_id, info.source_sn
         publisher = Publisher(str(sample.key_expr), str(source.zid), str(source.eid))
         with self._changed:
-            before = self._newest.pop(publisher, number)
+            known = self._newest.pop(publisher, None)
+            before = known if known is not None else number - 1 - self._lacking(sample)
+            before = max(before, -1)  # the first has the number 0
             self._newest[publisher] = max(before, number)
             if len(self._newest) > MAX_PUBLISHERS:
                 del self._newest[next(iter(self._newest))]
