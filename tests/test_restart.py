@@ -59,3 +59,13 @@ def test_the_map_goes_on_and_begins_anew_when_told(log: Path, tmp_path: Path) ->
     (aside,) = folder.glob("map-before-*")
     assert len(list(aside.glob("*.mcap"))) == 2
     assert hashes(facet("replay", aside)) == model["digest"]
+
+
+def test_another_map_finds_the_folder_taken(log: Path, tmp_path: Path) -> None:
+    """Its model would take the place of the one that is there."""
+    lived(log, tmp_path / "log")
+    model = digest_of_model(tmp_path / "log")
+    refused = process("run", "--record", tmp_path / "log", "--map", "other")
+    assert refused.returncode == 65
+    assert "holds the log of map 'map': --map map goes on with it" in refused.stderr
+    assert digest_of_model(tmp_path / "log") == model

@@ -33,7 +33,7 @@ from facet.resume import Newest, Resumed, hold, note_newest
 from facet.robots import admission_of, dialects_of
 from facet.sinks.answers import Answers, CommandError
 from facet.sinks.publisher import Publisher
-from facet.sinks.recorder import LogPosition, Recorder
+from facet.sinks.recorder import ACKNOWLEDGED, LogPosition, Recorder
 from facet.sinks.snapshots import Snapshots
 from facet.sources.live import Inbox, LiveSource
 from facet.sources.naming import source_of
@@ -48,10 +48,6 @@ DRAIN_S = 1.0  # at the end: for what has come in to become durable
 LAST_UPDATE_S = 2.5  # at the end: no update starts later than this after `stop`
 JOIN_S = 5.0
 ANSWER_S = 10.0
-ACKNOWLEDGED = {
-    "durable": "on the disk: survives a power cut",
-    "fast": "with the system: survives the end of the service, no power cut",
-}
 
 
 @dataclass(slots=True)
@@ -287,6 +283,7 @@ class Service:
     def _say_status(self) -> None:
         """To the network and into the log, which so carries its own account of what was lost."""
         gauge = self.account.gauge
+        gauge("paused", not self._running.is_set())
         gauge("queue_msgs", len(self._inbox) + len(self._durable))
         gauge("queue_bytes", self._inbox.num_bytes)
         gauge("waiting_for_points", self._admission.num_correcting)

@@ -15,8 +15,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from facet.commands.outcome import NO_SCAN_CURE, summary
 from facet.commands.play import parse_speed
-from facet.commands.replay import NO_SCAN_CURE, Replayed, replay_log, summary, write_outputs
+from facet.commands.replay import Replayed, replay_log, write_outputs
 from facet.commands.talk import statuses
 from facet.commands.terminal import (
     Exit,

@@ -36,6 +36,9 @@ def export(
     from facet.export.model import read_model
 
     name = (file_format or target.suffix.removeprefix(".")).lower()
+    if not name:
+        known = ", ".join(f".{own}" for own in FORMATS)
+        raise typer.BadParameter(f"{target} has no ending: give it one of {known}, or --format")
     if name not in FORMATS:
         raise typer.BadParameter(
             f"{name!r} is not one of {', '.join(FORMATS)}", param_hint="--format"
@@ -46,10 +49,12 @@ def export(
     if file.suffix == ".json":
         model, tiles = read_model(file), []
     else:
-        from facet.commands.replay import replay_log, require_scans
+        from facet.commands.outcome import require_scans, say_losses
+        from facet.commands.replay import replay_log
 
         result = replay_log([file], Config())
         require_scans(result)
+        say_losses(result)
         model, tiles, code = result.model(), result.mapper.points(), result.exit_code
     target.parent.mkdir(parents=True, exist_ok=True)
     FORMATS[name](model, tiles, target)

@@ -16,7 +16,7 @@ from facet.config import Config
 from facet.firsts import Firsts
 from facet.robots import dialects_of, recorded_robots
 from facet.sequences import SequenceLedger
-from facet.sources.dialects import Dialects
+from facet.sources.dialects import Dialect, Dialects
 from facet.sources.naming import is_correction, is_input, is_scan, names_of, source_of
 from facet.sources.recording import Recording
 from facet_protocol import topics
@@ -89,6 +89,8 @@ class Contents:
         if is_input(envelope):
             name = (envelope.key, envelope.schema, envelope.encoding)
             found = self.dialects.recognise_channel(*name)
+            if topics.is_erase_topic(envelope.key):
+                return str(Dialect.NATIVE)
             return str(found.dialect) if found else "not read"
         is_own = envelope.is_derived or envelope.key.startswith("/facet/")
         return "derived" if is_own else "not read"
@@ -216,7 +218,7 @@ def _utc(stamp_ns: int) -> str:
 
 
 def _model_info(path: Path) -> None:
-    from facet.commands.replay import summary
+    from facet.commands.outcome import summary
     from facet.export.model import read_model
 
     model = read_model(path)
@@ -248,8 +250,8 @@ def digest(
     facet digest out/log/model.json     # computes the derived hash again from the file
     facet digest out/log/map.checkpoint # of the map that it keeps
 
-    Equal scans give equal digests, in whatever order they came. Exit code 65: a model that does
-    not hash to what it says.
+    Equal scans give equal digests, in whatever order they came. Exit code 3: the log was damaged,
+    or scans of it were left out. 65: a model that does not hash to what it says.
     """
     existing([file])
     if file.suffix == ".json":
@@ -259,10 +261,12 @@ def digest(
 
         _print_digest(thaw_checkpoint(file)[1].digest())
         return
-    from facet.commands.replay import replay_log, require_scans
+    from facet.commands.outcome import require_scans, say_losses
+    from facet.commands.replay import replay_log
 
     result = replay_log([file], Config(), update_every="end")
     require_scans(result)
+    say_losses(result)
     _print_digest(result.mapper.digest())
     raise typer.Exit(result.exit_code)
 

@@ -180,6 +180,8 @@ def play(
             service.close()
             publisher.close()
     _conclude(num, publisher.sent, left if is_there else None)
+    if not is_there and maps:
+        raise typer.Exit(Exit.LOST)  # a service is there, and took none of it
 
 
 def _wait_until_taken(service: Acknowledgements, sent: Mapping[str, int]) -> int:

@@ -118,12 +118,18 @@ def serve(config: Config) -> Exit:
     """Run the service until a signal; the exit code."""
     from facet.export.model import write_model
     from facet.resume import Stopped
-    from facet.service import ACKNOWLEDGED, Service
-    from facet.sinks.recorder import single_writer
+    from facet.service import Service
+    from facet.sinks.recorder import ACKNOWLEDGED, maps_in, single_writer
 
     book = keep_log()
     if config.record.directory.is_file():
         raise InputError(f"{config.record.directory} is a file: the log needs a folder")
+    maps = sorted(maps_in(config.record.directory))
+    if maps and config.map.id not in maps:  # model.json is of one
+        text = (
+            f"{config.record.directory} holds the log of map {maps[0]!r}: --map {maps[0]} goes on"
+        )
+        raise InputError(f"{text} with it; for {config.map.id!r} give --record another folder")
     mapper = make_mapper(config)
     with single_writer(config.record.directory), stop_signals() as stop:
         load_loops(mapper.settings, logger.info)

@@ -155,6 +155,12 @@ def cmd(
             out.print(f"{key}: {value}")
 
 
+def _figure(value: float) -> str:
+    """A whole number whole: a robot may forget what is acknowledged up to it."""
+    is_whole = float(value).is_integer() or abs(value) >= 1000
+    return f"{value:,.0f}" if is_whole else f"{value:.3g}"
+
+
 def _table(current: Status) -> Table:
     balance = balance_of(current.counters, current.gauges)
     grid = Table(
@@ -167,7 +173,7 @@ def _table(current: Status) -> Table:
         grid.add_column(column, justify="right" if column in ("value", "ms") else "left")
     columns = [
         [(name, f"{num:,}") for name, num in current.counters.items()],
-        [(name, f"{value:,.3g}") for name, value in current.gauges.items()],
+        [(name, _figure(value)) for name, value in current.gauges.items()],
         [(name, f"{value:.1f}") for name, value in current.stage_ms.items()],
     ]
     for cells in zip_longest(*columns, fillvalue=("", "")):

@@ -24,6 +24,10 @@ logger = logging.getLogger(__name__)
 MAX_CHANNELS = 10_000  # of MCAP's 65,535: every start of a publisher takes one
 MIN_FREE_BYTES = 1 << 30  # kept for others, where nothing else is asked for: this much,
 MIN_FREE_SHARE = 0.02  # or this share of the disk, if that is more
+ACKNOWLEDGED = {
+    "durable": "on the disk: survives a power cut",
+    "fast": "with the system: survives the end of the service, no power cut",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -194,6 +198,12 @@ class Recorder:
             return self._min_free_bytes
         disk = os.statvfs(self._directory)
         return max(MIN_FREE_BYTES, int(MIN_FREE_SHARE * disk.f_blocks * disk.f_frsize))
+
+
+def maps_in(directory: Path) -> set[str]:
+    """The maps whose logs lie in a folder."""
+    found = (re.fullmatch(r"(.+)-\d{8}T\d{6}Z-\d+\.mcap", p.name) for p in directory.glob("*.mcap"))
+    return {match.group(1) for match in found if match}
 
 
 def log_files(directory: Path, name: str) -> list[Path]:
