@@ -175,7 +175,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             "?robot=r1;sensor=": "sensor= has no value",  # not: every one
             "?robot=r1;robot=r2": "robot= comes twice, 'r1' and 'r2'",
             "?robot=r1;speed=3": "'speed=3' is no parameter of erase, which takes robot=, sensor=",
-            "?robot=r9": "nothing was erased: unknown_scan",
+            "?robot=r9": "nothing of r9 was erased: unknown_scan",
         }.items():
             assert said in ask(client, COMMAND + parameters)
         assert service.account["scans_erased"] == 0

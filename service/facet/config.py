@@ -273,14 +273,16 @@ class Config(Section):
     queue: QueueSection = QueueSection()
     record: RecordSection = RecordSection()
     publish: PublishSection = PublishSection()
-    viewer: str = Field(default="off", description="off | web | native | connect:URL of a Rerun")
+    viewer: str = Field(
+        default="off", description="dashboard: off | web | native | connect:URL of a Rerun"
+    )
 
     @field_validator("viewer")
     @classmethod
     def _known_viewer(cls, viewer: str) -> str:
         if viewer in ("off", "web", "native") or viewer.startswith("connect:"):
             return viewer
-        raise ValueError("must be off, web, native or connect:URL")
+        raise ValueError(f"must be off, web, native or connect:URL, is {viewer!r}")
 
 
 def load_config(path: Path | None = None, overrides: dict[str, Any] | None = None) -> Config:
@@ -289,6 +291,10 @@ def load_config(path: Path | None = None, overrides: dict[str, Any] | None = Non
     Raises ConfigError, also for a file that is not there or not TOML.
     """
     tree = _read_toml(path) if path is not None else {}
+    try:
+        _validate(Config, tree)
+    except ConfigError as error:  # not of what is put on top
+        raise ConfigError(f"{path}: {error}") from None
     for dotted, value in (overrides or {}).items():
         if value is not None:
             _put(tree, dotted.split("."), value)
@@ -314,7 +320,9 @@ def _read_toml(path: Path) -> dict[str, Any]:
         return tomllib.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ConfigError(f"{path}: {error.strerror}") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: no text, byte {error.start} says: is it TOML?") from error
+    except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{path}: {error}") from error
 
 

@@ -52,7 +52,8 @@ class Erasing:
             with self._lock:
                 self._waiting.pop((erase.robot, stamp_ns), None)
         if corrected.reason:
-            raise CommandError(f"nothing was erased: {corrected.reason} (the log says more)")
+            text = f"nothing of {erase.robot} was erased: {corrected.reason} (the log says more)"
+            raise CommandError(text)
         return {"robot": erase.robot, "scans_erased": corrected.num_scans}
 
     def write(self, envelope: Envelope, message: Message | None) -> None:
