@@ -159,3 +159,15 @@ def test_a_section_that_is_no_table_is_named(tmp_path: Path) -> None:
     path.write_text("map = 3")
     with pytest.raises(ConfigError, match="map = 3: should be a table"):
         load_config(path, {"map.id": "hall"})
+
+
+def test_an_error_names_the_file_that_has_it(tmp_path: Path) -> None:
+    """What is put on top of it may be the cure, and may be the error."""
+    bad, good = tmp_path / "bad.toml", tmp_path / "good.toml"
+    bad.write_text("[mapping]\ntheta_deg = 99\n")
+    good.write_text("[mapping]\ntheta_deg = 12\n")
+    with pytest.raises(ConfigError, match=r"bad\.toml: mapping\.theta_deg"):
+        load_config(bad)
+    assert load_config(bad, {"mapping.theta_deg": 12.0}).mapping.theta_deg == 12.0
+    with pytest.raises(ConfigError, match=r"^mapping\.theta_deg"):
+        load_config(good, {"mapping.theta_deg": 99.0})

@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import re
 import tomllib
+from copy import deepcopy
 from ipaddress import ip_address
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar, get_args, get_origin
@@ -290,15 +291,25 @@ def load_config(path: Path | None = None, overrides: dict[str, Any] | None = Non
 
     Raises ConfigError, also for a file that is not there or not TOML.
     """
-    tree = _read_toml(path) if path is not None else {}
-    try:
-        _validate(Config, tree)
-    except ConfigError as error:  # not of what is put on top
-        raise ConfigError(f"{path}: {error}") from None
+    told = _read_toml(path) if path is not None else {}
+    tree = deepcopy(told)
     for dotted, value in (overrides or {}).items():
         if value is not None:
             _put(tree, dotted.split("."), value)
-    return _validate(Config, tree)
+    try:
+        return _validate(Config, tree)
+    except ConfigError as error:
+        if path is None or _is_valid(told):
+            raise
+        raise ConfigError(f"{path}: {error}") from None
+
+
+def _is_valid(tree: dict[str, Any]) -> bool:
+    try:
+        _validate(Config, tree)
+    except ConfigError:
+        return False
+    return True
 
 
 def load_credentials(path: Path) -> Credentials:

@@ -15,7 +15,7 @@ MOST = 0.5  # of the points: a wrong unit leaves out about all
 
 
 def print_result(result: Replayed, model: Model) -> None:
-    """What the replay gave, what was lost, and the digests."""
+    """What the replay of a log with scans gave, what was lost, and the digests."""
     say_losses(result)
     rejected = {
         name.removeprefix("points_rejected."): num
@@ -34,9 +34,8 @@ def print_result(result: Replayed, model: Model) -> None:
     out.print(f"state   {model['digest']['state']}")
     out.print(f"derived {model['digest']['derived']}")
     num, applied = result.num_scans, result.account["applied"]
-    share = 100.0 * applied / num if num else 100.0
     out.print(
-        f"mapped {applied:,} of {num:,} scans recorded ({share:.1f} %), "
+        f"mapped {applied:,} of {num:,} scans recorded ({100.0 * applied / num:.1f} %), "
         f"missing from the log {result.num_missing:,}"
     )
 

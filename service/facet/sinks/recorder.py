@@ -24,6 +24,7 @@ logger = logging.getLogger(__name__)
 MAX_CHANNELS = 10_000  # of MCAP's 65,535: every start of a publisher takes one
 MIN_FREE_BYTES = 1 << 30  # kept for others, where nothing else is asked for: this much,
 MIN_FREE_SHARE = 0.02  # or this share of the disk, if that is more
+_FILE = re.compile(r"(?P<map>.+)-(?P<stamp>\d{8}T\d{6}Z)-(?P<number>\d+)\.mcap")
 ACKNOWLEDGED = {
     "durable": "on the disk: survives a power cut",
     "fast": "with the system: survives the end of the service, no power cut",
@@ -202,8 +203,8 @@ class Recorder:
 
 def maps_in(directory: Path) -> set[str]:
     """The maps whose logs lie in a folder."""
-    found = (re.fullmatch(r"(.+)-\d{8}T\d{6}Z-\d+\.mcap", p.name) for p in directory.glob("*.mcap"))
-    return {match.group(1) for match in found if match}
+    found = (_FILE.fullmatch(path.name) for path in directory.glob("*.mcap"))
+    return {match["map"] for match in found if match}
 
 
 def log_files(directory: Path, name: str) -> list[Path]:
@@ -214,8 +215,10 @@ def log_files(directory: Path, name: str) -> list[Path]:
 
 def _parts(file: str, name: str) -> tuple[str, int]:
     """(stamp, number) of a log file's name; ("", 0) of another file's."""
-    match = re.fullmatch(rf"{re.escape(name)}-(\d{{8}}T\d{{6}}Z)-(\d+)\.mcap", file)
-    return (match.group(1), int(match.group(2))) if match else ("", 0)
+    match = _FILE.fullmatch(file)
+    if match is None or match["map"] != name:
+        return "", 0
+    return match["stamp"], int(match["number"])
 
 
 @contextmanager
