@@ -254,13 +254,16 @@ class LiveSource:
         self._push_native(sample)
 
     def _lacking(self, sample: zenoh.Sample) -> int:
-        """How many samples lie between what the log ends with and the first that came since."""
-        epoch, newest = self._newest.get(source_of(str(sample.key_expr)), (0, 0))
+        """How many samples lie between what the log ends with and the first that came since; none
+        of a source that is not in it, whatever its numbers say."""
+        known = self._newest.get(source_of(str(sample.key_expr)))
+        if known is None:
+            return 0
         try:
             mark = attachment.unpack(sample.attachment.to_bytes() if sample.attachment else b"")
         except ProtocolError:
             return 0
-        return max(0, mark.sequence - newest - 1) if mark.epoch == epoch else 0
+        return max(0, mark.sequence - known[1] - 1) if mark.epoch == known[0] else 0
 
     def _push_native(self, sample: zenoh.Sample) -> None:
         self._inbox.push(sample, self._dialects.recognise(*_names(sample)))
