@@ -231,6 +231,17 @@ def test_simulate_writes_scans_and_their_truth(tmp_path: Path) -> None:
     assert {e.key for e in Recording([out])} == {"facet/v1/map/robot/r7/scan/pushbroom"}
     truth = json.loads((tmp_path / "s.truth.json").read_text())
     assert truth["scene"] == "corridor"
+    made_by = "facet simulate s.mcap --scene corridor --duration 0.2 --robot r7"
+    assert made_by in facet("info", out)
+
+
+def test_a_recording_that_is_stopped_leaves_nothing_behind(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "facet", "simulate", str(tmp_path / "s.mcap")]
+    with subprocess.Popen([*command, "--sensor", "lidar3d"]) as process:
+        wait_until(lambda: any(tmp_path.iterdir()))
+        process.terminate()
+        assert process.wait(WAIT_S) == 128 + signal.SIGTERM
+    assert not any(tmp_path.iterdir())
 
 
 def scans_of(path: Path) -> list[Scan]:
@@ -372,6 +383,16 @@ def test_import_clouds_with_poses(tmp_path: Path, name: str, text: str) -> None:
     assert first.points.tolist() == [[1, 2, 3], [4, 5, 6]]
     assert (first.stamp_ns, second.stamp_ns) == (1_000_000_001, 2_500_000_000)
     assert second.pose.position.tolist() == [1, 0, 1]
+
+
+def test_a_cloud_by_itself_is_of_when_its_file_was_written(tmp_path: Path) -> None:
+    cloud = tmp_path / "a.ply"
+    cloud.write_text(PLY)
+    os.utime(cloud, ns=(0, 1_700_000_000_000_000_007))
+    facet("import", cloud, tmp_path / "a.mcap")
+    (scan,) = scans_of(tmp_path / "a.mcap")
+    assert scan.stamp_ns == 1_700_000_000_000_000_007
+    assert scan.pose.position.tolist() == [0, 0, 0]
 
 
 def test_stamps_are_exact() -> None:

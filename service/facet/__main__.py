@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import re
+import signal
 import sys
 
 import typer
@@ -68,6 +69,7 @@ def _root(
 
 def app_main() -> None:
     """Run the command; failures that are not ours become one line and an exit code."""
+    signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # tidies up, as Ctrl-C
     sys.exit(_run())
 
 

@@ -15,7 +15,15 @@ import typer
 from numpy.typing import NDArray
 
 from facet.commands.simulate import envelope_of
-from facet.commands.terminal import InputError, existing, megabytes, out, out_file, progress
+from facet.commands.terminal import (
+    InputError,
+    as_typed,
+    existing,
+    megabytes,
+    out,
+    out_file,
+    progress,
+)
 from facet.sinks.log_file import write_recording
 from facet_protocol.messages import Envelope, Pose, Scan, ScanKind
 
@@ -36,6 +44,7 @@ class PosedCloud:
 
 
 def import_(
+    context: typer.Context,
     source: Annotated[
         Path, typer.Argument(metavar="FILE|DIR", help=".npz, .ply or .pcd, or a folder of clouds.")
     ],
@@ -53,7 +62,7 @@ def import_(
     \b
     facet import corridor.npz corridor.mcap        # stamp_ns, T_world_sensor, points, lengths
     facet import clouds/ a.mcap --poses poses.txt  # *.ply or *.pcd in the order of their names
-    facet import scan.ply a.mcap                   # one cloud, taken at the origin of its frame
+    facet import scan.ply a.mcap                   # one cloud: at the origin, stamped as the file
 
     Points are metres in the sensor's frame. The arrays of an .npz of S scans: stamp_ns (S,),
     T_world_sensor (S, 4, 4), points (N, 3) of all scans one after the other, lengths (S,).
@@ -68,7 +77,7 @@ def import_(
                 yield envelope_of(_scan(cloud, robot, sensor, sequence), map_id)
                 bar.update(bar.task_ids[0], completed=sequence)
 
-    metadata = {"map": map_id, "frame": "map", "made_by": f"facet import {source.name}"}
+    metadata = {"map": map_id, "frame": "map", "made_by": as_typed(context)}
     num = write_recording(recording, envelopes(), metadata)
     out.print(f"{recording}: {num:,} scans, {megabytes(recording.stat().st_size)}")
 
@@ -99,7 +108,7 @@ def _open(source: Path, poses: Path | None) -> tuple[int, Iterator[PosedCloud]]:
     files = [source] if source.is_file() else _clouds_in(source)
     if poses is None and len(files) > 1:
         raise InputError(f"{source}: {len(files)} clouds need their poses: --poses FILE")
-    posed = _read_poses(poses) if poses else [(0, Pose(np.zeros(3), np.array([0.0, 0, 0, 1])))]
+    posed = _read_poses(poses) if poses else [_at_origin(source)]
     if len(posed) != len(files):
         raise InputError(f"{poses}: {len(posed)} poses for {len(files)} clouds")
     return len(files), (
@@ -157,6 +166,11 @@ def _require_rigid(path: Path, transforms: NDArray[np.float64]) -> None:
         raise InputError(
             f"{path}: T_world_sensor[{np.flatnonzero(is_bad)[0]}] is no rotation and translation"
         )
+
+
+def _at_origin(cloud: Path) -> tuple[int, Pose]:
+    """Of a cloud by itself: taken when its file was written."""
+    return cloud.stat().st_mtime_ns, Pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 
 
 def _pose_of(T_world_sensor: NDArray[np.float64]) -> Pose:

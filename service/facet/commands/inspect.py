@@ -142,7 +142,8 @@ def info(
 def _print_contents(recording: Recording, contents: Contents) -> None:
     channels = sorted(contents.channels.items())
     firsts = [channel.first_ns for _, channel in channels if channel.first_ns]
-    out.print(f"{len(recording.paths)} files, {megabytes(recording.num_bytes)}")
+    num = len(recording.paths)
+    out.print(f"{num} file{'s' * (num > 1)}, {megabytes(recording.num_bytes)}")
     if firsts:
         last_ns = max(channel.last_ns for _, channel in channels)
         out.print(f"{_utc(min(firsts))} to {_utc(last_ns)}, {(last_ns - min(firsts)) * 1e-9:.1f} s")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from facet.commands.terminal import megabytes, out, out_file, progress
+from facet.commands.terminal import as_typed, megabytes, out, out_file, progress
 from facet.sinks.log_file import write_recording
 from facet_protocol.codec import encode
 from facet_protocol.messages import Envelope, LineFan, Scan
@@ -18,6 +18,7 @@ LEAST = 0.001  # m/s, and scans a second: nothing moves at 0
 
 
 def simulate(
+    context: typer.Context,
     recording: Annotated[Path, typer.Argument(metavar="OUT.mcap", help="The recording.")],
     scene: Annotated[str, typer.Option(help="office | corridor | hall | hall85k")] = "office",
     sensor: Annotated[str, typer.Option(help="lidar3d | pushbroom | depth")] = "pushbroom",
@@ -91,7 +92,7 @@ def simulate(
     metadata = {
         "map": map_id,
         "frame": "map",
-        "made_by": f"facet simulate --scene {scene} --sensor {sensor} --seed {seed}",
+        "made_by": as_typed(context),
     }
     num = write_recording(recording, envelopes(), metadata, compression)
     truth_file = recording.with_suffix(".truth.json")
