@@ -30,6 +30,7 @@ _COS = (
     -1.13596475577881948265e-11,
 )
 
+LARGEST = float(np.finfo(np.float32).max)  # m; a longer range becomes inf: the map counts it
 KEPT_BEAMS = 4096  # directions of larger fans are not kept
 
 MAX_ANGLE = 1000.0  # rad; what sin_cos is accurate for, and more than any scanner turns
@@ -101,10 +102,16 @@ def project_fan(
 
 
 def _beam_ends(cosine: Floats, sine: Floats, ranges: Floats) -> NDArray[np.float32]:
+    if ranges.max(initial=0.0) <= LARGEST:
+        return _ends(cosine, sine, ranges)
+    with np.errstate(over="ignore"):  # half as long as all the rest
+        return _ends(cosine, sine, ranges)
+
+
+def _ends(cosine: Floats, sine: Floats, ranges: Floats) -> NDArray[np.float32]:
     ends = np.zeros((ranges.size, 3), dtype=np.float32)
-    with np.errstate(over="ignore"):  # a range beyond float32 becomes inf: the map counts it
-        ends[:, 0] = ranges * cosine
-        ends[:, 1] = ranges * sine
+    ends[:, 0] = ranges * cosine
+    ends[:, 1] = ranges * sine
     return ends
 
 

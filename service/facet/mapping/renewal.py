@@ -21,7 +21,7 @@ from facet.mapping.sums import MOMENTS, SUMS
 from facet.mapping.tally import Tally, catch_up, tally_points
 from facet.mapping.tile import Tile
 
-News = tuple[NDArray[np.uint16], NDArray[np.int64]]  # place (V,) of a voxel among the touched, plus
+News = tuple[NDArray[np.uint32], NDArray[np.int64]]  # place (V,) of a voxel among the touched, plus
 # 1, and what the sums of these were
 _NOTHING = np.zeros((0, SUMS), np.int64)
 
@@ -31,7 +31,7 @@ class Renewal:
 
     def __init__(self) -> None:
         self._stamp = 0
-        self._news = np.zeros(0, np.uint16)  # (V,) place of a voxel among the touched, plus 1
+        self._news = np.zeros(0, np.uint32)  # (V,) place of a voxel among the touched, plus 1
 
     def renew(
         self,
@@ -113,7 +113,7 @@ class Renewal:
     def _tell(self, touched: Touched, capacity: int) -> News:
         """Where the touched voxels are found among their sums before, and these."""
         if len(self._news) < capacity:
-            self._news = np.zeros(capacity, np.uint16)
+            self._news = np.zeros(capacity, np.uint32)
         if touched.before is None:
             return self._news, _NOTHING
         self._news[touched.rows] = np.arange(1, 1 + len(touched.rows))

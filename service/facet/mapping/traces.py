@@ -30,6 +30,7 @@ MOST_KEPT = 12  # sums of a voxel
 PASSING = MOST_KEPT  # place of sums that are not kept, until the next are asked for
 ENTRIES = 96 << 10  # sums of a share that are kept: those begun last
 MOST_CHANGES = 256  # dirty voxels round a block; with more, summing all again is no slower
+MOST_NEW = 8  # of these were empty: with more it is a frontier, where sums kept are not used again
 STATE = 10  # numbers of the state of a look: sums at hand; a bit each of those asked for; radius up
 # to which the votes are listed; how many these are; whether nothing asked for was dropped; the
 # radius, the largest one until now and a bit each of those that were looked at; the key of the sums
@@ -267,7 +268,7 @@ def forget(traces, share, row):  # type: ignore[no-untyped-def]
 @kernel(allocates=False)
 def list_changes(blocks, columns, bits, dirty, near, blocks_out, changes):  # type: ignore[no-untyped-def]
     """List the dirty voxels of the blocks `near`, whose bits are set in bits (B, 8). How many, -1:
-    too many."""
+    too many, or too many new ones."""
     rows, before, first, following = dirty
     width = 2 * blocks_out + 1
     number = np.uint64(0)
@@ -277,7 +278,7 @@ def list_changes(blocks, columns, bits, dirty, near, blocks_out, changes):  # ty
                 number += population(bits[near[n], z])
     if number > np.uint64(MOST_CHANGES):
         return -1
-    count = 0
+    count, num_new = 0, 0
     for n in range(width * width * width):
         if near[n] < 0:
             continue
@@ -292,6 +293,9 @@ def list_changes(blocks, columns, bits, dirty, near, blocks_out, changes):  # ty
             changes[2, count] = z0 + (local >> 6)
             changes[3, count] = before[d - 1]
             changes[4, count] = columns.observable[rows[d - 1]]
+            num_new += before[d - 1] == 0
+            if num_new > MOST_NEW:
+                return -1
             count += 1
             d = following[d - 1]
     return count
