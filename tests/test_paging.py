@@ -104,7 +104,7 @@ def explore(folder: Path) -> None:
     update, the bound, how often it gave back, voxels, digest."""
     whole, held = log(ROOM), []
     mapped(whole.scans[:1], whole.settings)  # compiled loops are loaded
-    before, bound = shared_bytes(), resident_bytes() + 32 * MIB
+    before, bound = shared_bytes(), resident_bytes() + 24 * MIB
     memory = PagedMemory(folder, bound)
     mapper = Mapper(whole.settings, memory=memory)
     explored(mapper, lambda: held.append((resident_bytes(), shared_bytes() - before)))
