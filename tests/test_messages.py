@@ -1,5 +1,7 @@
 """The values themselves: rotation, lifting, tile points."""
 
+from dataclasses import fields
+
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -7,7 +9,8 @@ from scipy.spatial.transform import Rotation
 
 import facet_protocol
 from examples import plane
-from facet_protocol import Pose, TilePoints
+from facet_protocol import Envelope, Pose, TilePoints
+from facet_protocol.messages import Rule
 
 
 @given(st.integers(0, 10_000))
@@ -45,3 +48,15 @@ Events facet_descriptors Hole HoleKind LineFan Loss MapMirror MapUpdate Message 
 PlaneFrame Pose project project_fan ProtocolError ResolvedPose Scan ScanKind Schema SCHEMAS sin_cos
 StampedPose StampedTransform Status Surface TilePoints Tombstone topics Transforms
 """
+
+
+def test_an_owned_envelope_differs_in_whose_bytes_it_has_alone() -> None:
+    whole = b"before payload after"
+    rule = Rule("a/**", frame="base")
+    view = Envelope("a/b", "S", "cdr", memoryview(whole)[7:14], 1, 2, 3, 4, rule, is_derived=True)
+    owned = view.owned()
+    assert isinstance(owned.payload, bytes)
+    for field in fields(Envelope):
+        assert getattr(owned, field.name) == getattr(view, field.name)
+        assert getattr(view, field.name) != field.default  # or it could be left out
+    assert owned.owned() is owned

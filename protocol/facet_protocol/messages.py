@@ -44,6 +44,15 @@ class Envelope:
     rule: Rule | None = None  # what the settings say about its key
     is_derived: bool = False  # Facet itself wrote it: no input
 
+    def owned(self) -> Envelope:
+        """With a payload of its own: a view would keep all that it is a part of."""
+        if isinstance(self.payload, bytes):
+            return self
+        return Envelope(
+            self.key, self.schema, self.encoding, bytes(self.payload), self.stamp_ns, self.epoch,
+            self.sequence, self.received_ns, self.rule, self.is_derived,
+        )  # fmt: skip
+
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Pose:

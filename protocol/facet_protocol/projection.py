@@ -91,21 +91,14 @@ def project_fan(
     """
     r = np.asarray(ranges, dtype=np.float64)
     sine, cosine = fan_directions(start_angle, end_angle, r.size)
-    hit = (r > 0.0) & (r < np.inf)
-    if hit.all():
-        return _beam_ends(cosine, sine, r), np.zeros((0, 3), np.float32)
-    empty = r == np.inf
-    return (
-        _beam_ends(cosine[hit], sine[hit], r[hit]),
-        _beam_ends(cosine[empty], sine[empty], np.full(int(empty.sum()), float(reach_m))),
-    )
-
-
-def _beam_ends(cosine: Floats, sine: Floats, ranges: Floats) -> NDArray[np.float32]:
-    if ranges.max(initial=0.0) <= LARGEST:
-        return _ends(cosine, sine, ranges)
-    with np.errstate(over="ignore"):  # half as long as all the rest
-        return _ends(cosine, sine, ranges)
+    hit = (r > 0.0) & (r <= LARGEST)
+    if np.count_nonzero(hit) == r.size:  # as most are
+        return _ends(cosine, sine, r), np.zeros((0, 3), np.float32)
+    hits, empty = ((r > 0.0) & (r < np.inf)).nonzero()[0], (r == np.inf).nonzero()[0]
+    reach = np.full(len(empty), float(reach_m))
+    with np.errstate(over="ignore"):
+        points = _ends(cosine[hits], sine[hits], r[hits])
+        return points, _ends(cosine[empty], sine[empty], reach)
 
 
 def _ends(cosine: Floats, sine: Floats, ranges: Floats) -> NDArray[np.float32]:

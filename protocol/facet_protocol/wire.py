@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Sequence
 from typing import TypeVar
 
 import numpy as np
@@ -50,33 +50,34 @@ def _varint(data: memoryview, position: int) -> tuple[int, int]:
 
 def _skip(data: memoryview, position: int, wire_type: int) -> int:
     """Position after a value that starts at `position`."""
+    if wire_type == _BYTES:
+        length, position = _varint(data, position)
+        return position + length
     if wire_type == _VARINT:
         return _varint(data, position)[1]
     if wire_type == _FIXED64:
         return position + 8
     if wire_type == _FIXED32:
         return position + 4
-    if wire_type == _BYTES:
-        length, position = _varint(data, position)
-        return position + length
     raise ProtocolError(f"wire type {wire_type} at byte {position}")
 
 
-def _top_fields(data: memoryview) -> Iterator[tuple[int, int, int, int]]:
+def _top_fields(data: memoryview) -> list[tuple[int, int, int, int]]:
     """(start, tag, begin, end) of each top-level field: its value, with its length, is in
     [begin, end)."""
-    position = 0
-    for _ in range(MAX_TOP_FIELDS):
-        if position >= len(data):
-            return
-        start = position
-        tag, begin = _varint(data, position)
-        position = _skip(data, begin, tag & 7)
-        if position > len(data):
-            raise ProtocolError(f"field {tag >> 3} ends at byte {position} of {len(data)}")
-        yield start, tag, begin, position
-    if position < len(data):
-        raise ProtocolError(f"more than {MAX_TOP_FIELDS} fields")
+    fields: list[tuple[int, int, int, int]] = []
+    position, size = 0, len(data)
+    while position < size:
+        if len(fields) == MAX_TOP_FIELDS:
+            raise ProtocolError(f"more than {MAX_TOP_FIELDS} fields")
+        start, tag, begin = position, data[position], position + 1
+        if tag >= 0x80:
+            tag, begin = _varint(data, position)
+        position = begin + 8 if tag & 7 == _FIXED64 else _skip(data, begin, tag & 7)
+        if position > size:
+            raise ProtocolError(f"field {tag >> 3} ends at byte {position} of {size}")
+        fields.append((start, tag, begin, position))
+    return fields
 
 
 def split_bytes_field(
@@ -146,7 +147,7 @@ def check_pose(position: Iterable[float], orientation_xyzw: Iterable[float]) -> 
     Raises ProtocolError: bad_pose when something is not finite, bad_quaternion when the norm is off
     by more than NORM_TOLERANCE. By + * / sqrt alone: the same bits on every machine.
     """
-    p, q = [float(c) for c in position], [float(c) for c in orientation_xyzw]
+    p, q = [*map(float, position)], [*map(float, orientation_xyzw)]
     if len(p) != 3 or len(q) != 4:
         raise ProtocolError(f"pose of {len(p)} + {len(q)} numbers, expected 3 + 4", "bad_pose")
     if not all(map(math.isfinite, (*p, *q))):

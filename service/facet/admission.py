@@ -111,7 +111,7 @@ class Admission:
         self._resolution = Resolution(frame_id, wait_ns, wait_bytes, logged=logged)
         self._firsts = Firsts()
         self._trajectories = Trajectories()
-        self._rivals = rivals = Rivals(self.past)
+        rivals = Rivals(self.past)
         self.corrections = Corrections(
             frame_id,
             self._firsts,
@@ -222,10 +222,8 @@ class Admission:
         self, envelope: Envelope, inner: Envelope, source: str, known: _Foreseen | None
     ) -> Sequence[Outcome]:
         scan = self._decode(inner, known.scan if known is not None else None)
-        if known is not None:
-            self._rivals.know(envelope, known.digest)
         self._check_publisher(envelope, source)
-        if not self._placement.meets(envelope, source):
+        if not self._placement.meets(envelope, source, known.digest if known is not None else None):
             return []
         if scan.renormalised:
             self._account.count("renormalised", source)

@@ -9,7 +9,6 @@ from array import array
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -79,8 +78,10 @@ class Past:
     def note_read(self, stream: McapStream, envelope: Envelope) -> None:
         """The message that a stream has just read."""
         if envelope.sequence and is_scan(envelope):
-            self.note(stream.path, stream.offset, stream.offset + 1, (envelope,))
-            self.define(stream.path, stream.definitions.copy)
+            with self._lock:
+                segment = self._segment(stream.path, stream.offset, stream.offset + 1)
+                self._widen((source_of(envelope), envelope.epoch), segment, envelope.sequence)
+                self._known[stream.path] = stream.definitions.copy
 
     def define(self, path: Path, known: Known) -> None:
         """What was defined in a file, for one that has not yet said so at its end."""
@@ -139,25 +140,31 @@ class Past:
 
     def _segment(self, path: Path, start: int, end: int) -> int:
         """The number of the segment that now reaches to `end`."""
-        if not self._files or self._files[-1] != path:
+        last = self._files[-1] if self._files else None
+        if last is not path and last != path:  # most are the very same: a path takes its time
             self._files.append(path)
-        file, last = len(self._files) - 1, len(self._segments) - 3
-        if last >= 0 and self._segments[last] == file:
-            first = self._segments[last + 1]
+        file, at = len(self._files) - 1, len(self._segments) - 3
+        if at >= 0 and self._segments[at] == file:
+            first = self._segments[at + 1]
             if first <= start < first + self._segment_bytes:
-                self._segments[last + 2] = max(end, self._segments[last + 2])
-                return last // 3
+                self._segments[at + 2] = max(end, self._segments[at + 2])
+                return at // 3
         self._segments.extend((file, start, end))
         return len(self._segments) // 3 - 1
 
     def _widen(self, name: tuple[str, int], segment: int, sequence: int) -> None:
-        if name not in self._ranges and len(self._ranges) >= MAX_SENSORS:
-            return
         if sequence >= 1 << 63:
             return
-        ranges = self._ranges.setdefault(name, array("q"))
+        ranges = self._ranges.get(name)
+        if ranges is None:
+            if len(self._ranges) >= MAX_SENSORS:
+                return
+            ranges = self._ranges[name] = array("q")
         if ranges and ranges[-3] == segment:
-            ranges[-2], ranges[-1] = min(ranges[-2], sequence), max(ranges[-1], sequence)
+            if sequence < ranges[-2]:
+                ranges[-2] = sequence
+            elif sequence > ranges[-1]:
+                ranges[-1] = sequence
         else:
             ranges.extend((segment, sequence, sequence))
 
@@ -193,7 +200,7 @@ class Past:
                     continue
                 envelope = envelope_of(message, self._dialects)
                 if envelope.sequence in sequences and is_scan(envelope):
-                    yield _copied(envelope)
+                    yield envelope.owned()
         except LogError as error:
             raise OSError(str(error)) from error
 
@@ -226,7 +233,3 @@ def _is_finished(path: Path) -> bool:
     with path.open("rb") as file:
         file.seek(max(0, os.fstat(file.fileno()).st_size - len(MAGIC)))
         return file.read() == MAGIC
-
-
-def _copied(envelope: Envelope) -> Envelope:
-    return replace(envelope, payload=bytes(envelope.payload))

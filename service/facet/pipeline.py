@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections import Counter
+from collections import Counter, defaultdict
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
@@ -163,8 +163,8 @@ class Pipeline:
         What is in them of a scan that is taken out goes with it, so that points in = stored +
         rejected holds, and each of them, of the scans that are in the map."""
         taken_out, inserted = self._mapper.retract(old), self._mapper.insert(new)
-        changes = Counter(_points(new, inserted))
-        changes.subtract(_points(old, taken_out))
+        changes = _points([(new, inserted)])
+        changes.subtract(_points([(old, taken_out)]))
         return dict(changes)
 
     def _put_in(self) -> None:
@@ -173,8 +173,12 @@ class Pipeline:
         if not admitted:
             return
         inserted = self._mapper.insert_all([one.scan for one in admitted])
+        by_source: defaultdict[str, list[tuple[Scan, Counted]]] = defaultdict(list)
         for one, counted in zip(admitted, inserted, strict=True):
-            self._account.settle(one.scan.source, "applied", also=_points(one.scan, counted))
+            by_source[one.scan.source].append((one.scan, counted))
+        for source, counts in by_source.items():
+            self._account.settle(source, "applied", len(counts), _points(counts))
+        for one in admitted:
             self._note(one)
 
     def _replace(self, one: Admitted, replaced: Scan) -> None:
@@ -266,14 +270,14 @@ class Pipeline:
                 sink.write(envelope, message)
 
 
-def _points(scan: Scan, counted: Counted) -> dict[str, int]:
-    """What the points of a scan are counted under: points in = stored + rejected."""
-    points: dict[str, int] = {}
-    for reason, num in (*counted.rejected.items(), *scan.ignored.items()):
-        name = f"points_rejected.{reason}"
-        points[name] = points.get(name, 0) + num
-    points["points_in"] = len(scan.points) + sum(scan.ignored.values())
-    points["points_stored"] = counted.points_stored
+def _points(counts: Sequence[tuple[Scan, Counted]]) -> Counter[str]:
+    """What the points of scans are counted under: points in = stored + rejected."""
+    points: Counter[str] = Counter()
+    for scan, counted in counts:
+        points["points_in"] += len(scan.points) + sum(scan.ignored.values())
+        points["points_stored"] += counted.points_stored
+        for reason, num in (*counted.rejected.items(), *scan.ignored.items()):
+            points[f"points_rejected.{reason}"] += num
     return points
 
 

@@ -54,9 +54,10 @@ class Placement:
         self._as_mapped, self._reject_jumps = as_mapped, reject_jumps
         self._plausibility = Plausibility()
 
-    def meets(self, envelope: Envelope, source: str) -> bool:
-        """Whether a scan that has come goes on; else it was there, and is counted."""
-        claim = self._rivals.claim(envelope, source)
+    def meets(self, envelope: Envelope, source: str, digest: bytes | None = None) -> bool:
+        """Whether a scan that has come goes on; else it was there, and is counted. `digest`: of its
+        payload, where that is known."""
+        claim = self._rivals.claim(envelope, source, digest)
         is_first = self._firsts.is_first(envelope, source)
         if claim is None:
             verdict = Verdict.FIRST if is_first else Verdict.DUPLICATE

@@ -5,8 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +19,7 @@ JUMP_M = 5.0  # farther than this apart,
 JUMP_COS = math.cos(math.radians(90.0) / 2.0)  # or turned by more than 90 degrees: a jump
 
 
-@dataclass(frozen=True, slots=True)
-class _Last:
+class _Last(NamedTuple):
     stamp_ns: int  # the newest
     pose: Pose
 

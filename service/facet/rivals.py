@@ -7,7 +7,6 @@ import hashlib
 import json
 from collections import OrderedDict
 from collections.abc import Iterable, Mapping
-from dataclasses import replace
 from enum import StrEnum
 from typing import Any, NamedTuple
 
@@ -126,24 +125,23 @@ class Rivals:
         self._window: OrderedDict[Number, Envelope] = OrderedDict()
         self._num_bytes = 0
         self._met_bytes = 0  # of all scans that ever came
-        self._hashed, self._digest = Envelope("", "", "", b""), b""
+        self._asked, self._claim = Envelope("", "", "", b""), Claim(Number("", 0, 0), b"")
         self._chosen: dict[Number, bytes] = {}
         self._refused: dict[tuple[str, int], Numbers] = {}
 
-    def know(self, envelope: Envelope, digest: bytes) -> None:
-        """The hash of the scan that it asks about next (`digest_of`)."""
-        self._hashed, self._digest = envelope, digest
-
-    def claim(self, envelope: Envelope, source: str) -> Claim | None:
-        """What it claims; None for one whose number does not count."""
+    def claim(self, envelope: Envelope, source: str, digest: bytes | None = None) -> Claim | None:
+        """What it claims; None for one whose number does not count. `digest`: its hash, where that
+        is known (`digest_of`)."""
+        if envelope is self._asked:  # most are asked about twice in a row
+            return self._claim
         if not envelope.sequence or is_loose(envelope):
             return None
         if max(envelope.epoch, envelope.sequence) >= 1 << 64:  # a log from elsewhere may say so
             return None
-        if envelope is not self._hashed:  # most are asked about twice in a row
-            self.know(envelope, digest_of(envelope))
         number = Number(source, envelope.epoch, envelope.sequence)
-        return Claim(number, self._digest, len(envelope.payload))
+        self._claim = Claim(number, digest or digest_of(envelope), len(envelope.payload))
+        self._asked = envelope
+        return self._claim
 
     def meet(self, claim: Claim, *, is_first: bool) -> Verdict:
         """It has come; `is_first`: none with its number had. FIRST and WINS go on to `judge`."""
@@ -299,9 +297,7 @@ class Rivals:
         """In the window: as bytes of its own, for a view would keep a whole chunk."""
         old = self._window.pop(number, None)
         self._num_bytes += len(envelope.payload) - (len(old.payload) if old is not None else 0)
-        is_view = isinstance(envelope.payload, memoryview)
-        own = replace(envelope, payload=bytes(envelope.payload)) if is_view else envelope
-        self._window[number] = own
+        self._window[number] = envelope.owned()
         while self._num_bytes > self._window_bytes:
             self._num_bytes -= len(self._window.popitem(last=False)[1].payload)
 

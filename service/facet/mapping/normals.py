@@ -27,7 +27,7 @@ from facet.mapping.memory import Heap, Memory, grow_all, sparse
 from facet.mapping.principal import ABREAST, analyse_all, put, solve, take_over
 from facet.mapping.runs import dealt
 from facet.mapping.settings import MapSettings
-from facet.mapping.staleness import find_candidates, find_stale, mark_dirty
+from facet.mapping.staleness import ASKED, RINGS, find_candidates, find_stale, mark_dirty
 from facet.mapping.store import Dirty, VoxelStore
 from facet.mapping.traces import (
     KNOWN,
@@ -248,6 +248,7 @@ class NormalField:
         self._dirty = np.zeros((0, 8), np.uint64)
         self._first = np.zeros(0, np.int32)  # dirty voxels by block, see mark_dirty
         self._flags = np.zeros(0, np.bool_)
+        self._asked = np.empty((RINGS, ASKED), np.int64)
         self._halos, self._scratches = make_halos(SHARES), sparse(SHARES, SCRATCH)
         self._looks = sparse(SHARES * ABREAST, LOOK).reshape(SHARES, ABREAST)
         self._traces = make_traces(SHARES)
@@ -289,7 +290,8 @@ class NormalField:
     def _candidates(self, store: VoxelStore, sources: NDArray[np.int32]) -> NDArray[np.int32]:
         """Blocks (C,) that may hold stale voxels, those with dirty ones being `sources`."""
         near = np.empty(store.num_blocks, np.int32)
-        return near[: find_candidates(store.blocks, self._deepest, sources, self._flags, near)]
+        room = self._flags, self._asked, near
+        return near[: find_candidates(store.blocks, self._deepest, sources, *room)]
 
     def _fit(self, store: VoxelStore) -> None:
         rows, blocks = len(store.columns.block), len(store.blocks.keys)

@@ -5,10 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from facet.mapping.bits import population
-from facet.mapping.blocks import find, list_voxels, pack, unpack
+from facet.mapping.blocks import CENTRE, EMPTY, find, list_voxels, pack, unpack
 from facet.mapping.halo import SIDE_BLOCKS, fill_rows, find_near
 from facet.mapping.kernel import kernel
 from facet.mapping.settings import BLOCK
+
+RINGS = SIDE_BLOCKS // 2 - 1  # of blocks, beyond a block and its neighbours, that are looked at
+ASKED = 16**3  # places for blocks that were looked up: those beside one another do not meet
 
 
 @kernel(allocates=False)
@@ -48,30 +51,32 @@ def _clear(flags, out, count):  # type: ignore[no-untyped-def]
 
 
 @kernel(allocates=False)
-def find_candidates(blocks, deepest, sources, flags, out):  # type: ignore[no-untyped-def]
+def find_candidates(blocks, deepest, sources, flags, asked, out):  # type: ignore[no-untyped-def]
     """Blocks that look as far as one of the blocks `sources`, these included. deepest (1 + B,):
-    the largest reach of all, then by block. Returns how many."""
+    the largest reach of all, then by block; asked (RINGS, ASKED): room. Returns how many."""
     count = 0
-    side = 2 * (SIDE_BLOCKS // 2) + 1
+    asked[:] = EMPTY
     for s in range(sources.shape[0]):
-        bi, bj, bk = unpack(blocks.keys[sources[s]])
-        for n in range(side * side * side):
-            di = n % side - side // 2
-            dj = (n // side) % side - side // 2
-            dk = n // (side * side) - side // 2
-            gap = BLOCK * max(abs(di), abs(dj), abs(dk)) - BLOCK + 1
-            if gap <= 1:
-                target = np.int64(sources[s])
-                if gap == 1:
-                    place = (di + 1) + 3 * (dj + 1) + 9 * (dk + 1)
-                    target = np.int64(blocks.neighbours[sources[s], place])
-            elif gap > deepest[0]:
-                continue
-            else:
-                key = pack(bi + di, bj + dj, bk + dk)
-                target = np.int64(find(blocks.table_keys, blocks.table_values, key))
-            if target >= 0 and (deepest[1 + target] >= gap or target == sources[s]):
+        for n in range(27):
+            target = np.int64(blocks.neighbours[sources[s], n]) if n != CENTRE else sources[s]
+            if target >= 0 and (deepest[1 + target] >= 1 or n == CENTRE):
                 count = _list_once(target, flags, out, count)
+        bi, bj, bk = unpack(blocks.keys[sources[s]])
+        for ring in range(2, 2 + RINGS):
+            if deepest[0] <= BLOCK * (ring - 1):
+                break
+            for dk in range(-ring, ring + 1):
+                for dj in range(-ring, ring + 1):
+                    step = 1 if max(abs(dj), abs(dk)) == ring else 2 * ring  # its two ends alone
+                    for di in range(-ring, ring + 1, step):
+                        i, j, k = bi + di, bj + dj, bk + dk
+                        key, place = pack(i, j, k), (i & 15) | ((j & 15) << 4) | ((k & 15) << 8)
+                        if asked[ring - 2, place] == key:
+                            continue
+                        asked[ring - 2, place] = key
+                        target = np.int64(find(blocks.table_keys, blocks.table_values, key))
+                        if target >= 0 and deepest[1 + target] > BLOCK * (ring - 1):
+                            count = _list_once(target, flags, out, count)
     return _clear(flags, out, count)
 
 

@@ -40,8 +40,9 @@ class Recording:
             stream = McapStream(path)
             self.damage[path], self.metadata = stream.damage, {}
             for message in stream.messages():
-                self.metadata.update((m.name, m.metadata) for m in stream.metadata)
-                stream.metadata.clear()
+                if stream.metadata:
+                    self.metadata.update((m.name, m.metadata) for m in stream.metadata)
+                    stream.metadata.clear()
                 envelope = envelope_of(message, self._dialects, is_own="facet" in self.metadata)
                 self._on_message(stream, envelope)
                 yield envelope
