@@ -19,6 +19,7 @@ import psutil
 import pytest
 import zenoh
 
+from facet import status
 from facet.commands.replay import replay_log
 from facet.config import Config, NetworkSection, load_config
 from facet.mapping.mapper import Mapper
@@ -90,6 +91,21 @@ def test_f19_gaps_and_late_arrivals(tmp_path: Path, caplog: Log) -> None:
     assert losses(tmp_path) == [("r1", 3, 3, "lost_upstream"), ("r1", 4, 1, "recovered_late")]
     said = [m for m in caplog.messages if "lost_upstream" in m]
     assert said == ["r1/lidar: lost_upstream: 3 scans from sequence 3"]
+
+
+def test_f19_gaps_of_sources_beyond_those_counted_by_name_add_up(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(status, "MAX_SOURCES", 1)
+    with running(tmp_path) as (service, _, client):
+        wait_for_ear(client)
+        for robot, sequences in (("r1", (1, 2)), ("r2", (1, 4)), ("r3", (1, 5, 3))):
+            for sequence in sequences:
+                put(client, sequence, robot=robot)
+        wait_until(lambda: service.account["applied"] == 7, 60)
+        account = service.account
+        assert account["lost_upstream[others]"] == account["lost_upstream"] == 2 + 3 - 1
+        service.stop()
 
 
 def test_f20_a_publisher_that_begins_anew(tmp_path: Path) -> None:

@@ -8,9 +8,11 @@ from dataclasses import astuple
 from types import SimpleNamespace
 from typing import Any
 
+import pytest
 import zenoh
 
 from facet.commands.play import RobotPublisher
+from facet.sources import live
 from facet.sources.dialects import split_encoding
 from facet.sources.live import Inbox, LiveSource
 from facet.status import Account
@@ -139,6 +141,17 @@ def test_the_oldest_is_shed_and_remembered() -> None:
     (loss,) = inbox.take_shed()
     assert astuple(loss) == ("r1", "front", 9, 1, 4, "shed_overload", 42)
     assert inbox.take_shed() == []
+
+
+def test_no_more_is_taken_at_once_than_a_log_has_channels_for(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(live, "MOST_TAKEN", 3)
+    inbox = Inbox(1000, 1 << 20)
+    for sequence in range(1, 8):
+        inbox.push(sample(sequence))
+    taken = [[e.sequence for e in inbox.take(1 << 20)] for _ in range(4)]
+    assert taken == [[1, 2, 3], [4, 5, 6], [7], []]
 
 
 def test_bytes_are_bounded_too() -> None:

@@ -73,6 +73,10 @@ class Pose:
         )
 
 
+IDENTITY = Pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))  # of what is given in its own frame
+IDENTITY.position.flags.writeable = IDENTITY.orientation_xyzw.flags.writeable = False
+
+
 class ScanKind(StrEnum):
     LINE = "line"  # one flat fan of beams: a single such scan never makes a plane
     CLOUD = "cloud"  # points in three dimensions

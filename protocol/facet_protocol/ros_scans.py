@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from facet_protocol.cdr import CdrReader
-from facet_protocol.messages import Envelope, Pose, ProtocolError, Scan, ScanKind
+from facet_protocol.messages import IDENTITY, Envelope, ProtocolError, Scan, ScanKind
 from facet_protocol.projection import MAX_ANGLE, count_ignored, project_fan
 from facet_protocol.ros import Header, read_header
 from facet_protocol.ros_definitions import LASER_SCAN, POINT_CLOUD
@@ -17,7 +17,6 @@ from facet_protocol.ros_definitions import LASER_SCAN, POINT_CLOUD
 _CODES = ("", "i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")  # PointField.datatype
 _AXES = ("f4", "f8")
 _FIELD_BYTES = 4 + 4 + 1 + 4  # the least that a PointField takes
-_IDENTITY = Pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 _NONE = np.empty((0, 3), dtype=np.float32)
 
 
@@ -60,7 +59,7 @@ def decode_ros_scan(envelope: Envelope, robot: str, sensor: str, reach_m: float)
         stamp_ns=header.stamp_ns,
         frame_id=header.frame_id,
         kind=kind,
-        pose=_IDENTITY,
+        pose=IDENTITY,
         points=points,
         no_return=no_return,
         ignored=ignored,

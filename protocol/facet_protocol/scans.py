@@ -9,7 +9,15 @@ from foxglove_schemas_protobuf.LaserScan_pb2 import LaserScan
 from foxglove_schemas_protobuf.PointCloud_pb2 import PointCloud
 
 from facet_protocol.cloud import DATA_FIELD, pack_points, read_layout, read_points, split_beams
-from facet_protocol.messages import Envelope, LineFan, Pose, ProtocolError, Scan, ScanKind
+from facet_protocol.messages import (
+    IDENTITY,
+    Envelope,
+    LineFan,
+    Pose,
+    ProtocolError,
+    Scan,
+    ScanKind,
+)
 from facet_protocol.poses import pose_message, pose_of
 from facet_protocol.projection import MAX_ANGLE, count_ignored, project_fan
 from facet_protocol.ros_definitions import ROS_SCANS
@@ -21,8 +29,6 @@ FAN_SCHEMA = "foxglove.LaserScan"
 SCAN_SCHEMAS = (CLOUD_SCHEMA, FAN_SCHEMA, *ROS_SCANS)
 RANGES_FIELD = LaserScan.RANGES_FIELD_NUMBER
 REACH_M = 8.0  # how far a line beam that came back empty counts as free, unless the map says so
-
-_IDENTITY = Pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
 
 
 class _Head(NamedTuple):
@@ -46,7 +52,7 @@ def _head(
         return _Head(stamp_ns, message.frame_id, *pose_of(message.pose))
     if pose_required:
         raise ProtocolError(f"{envelope.schema}: no pose", "bad_pose")
-    return _Head(stamp_ns, message.frame_id, _IDENTITY, False, has_pose=False)
+    return _Head(stamp_ns, message.frame_id, IDENTITY, False, has_pose=False)
 
 
 def decode_scan(

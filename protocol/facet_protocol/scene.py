@@ -15,7 +15,7 @@ from foxglove_schemas_protobuf.SceneEntityDeletion_pb2 import SceneEntityDeletio
 from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from numpy.typing import NDArray
 
-from facet_protocol.messages import HoleKind, MapUpdate, Plane, PlaneClass, Pose, TilePoints
+from facet_protocol.messages import IDENTITY, HoleKind, MapUpdate, Plane, PlaneClass, TilePoints
 from facet_protocol.poses import pose_message
 from facet_protocol.wire import timestamp_of
 
@@ -42,7 +42,7 @@ _POINT = np.dtype(
         ("z_field", "u1"), ("z", "<f8"),
     ]
 )  # fmt: skip
-_IDENTITY = pose_message(Pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])))
+_IDENTITY = pose_message(IDENTITY)
 
 
 def _points_field(xyz: NDArray[np.float64]) -> bytes:

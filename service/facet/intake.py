@@ -220,6 +220,8 @@ class Intake:
                 due = time.monotonic() + self._commit_s
         self._take()
         while len(self._inbox):  # more than one commit takes
+            if not self._failure:
+                self._commit()
             self._take()
         self._take_own()
         self._finish()
@@ -263,13 +265,7 @@ class Intake:
             self._account.count("duplicate_publisher", source)
             text = f"epochs alternate ({envelope.epoch}): two publishers share the name"
             self._account.complain(source, "duplicate_publisher", text)
-        if noted.skipped or noted.is_late:
-            self._say_missing(source)
-
-    def _say_missing(self, source: str) -> None:
-        missing = self._ledger.missing(source)[source]
-        self._account.set_counter("lost_upstream", missing, source)
-        self._account.set_counter("lost_upstream", sum(self._ledger.missing().values()))
+        self._account.count("lost_upstream", source, noted.skipped - noted.is_late)
 
     def _lose(self, loss: Loss) -> None:
         """What the inbox had to drop did arrive: it is no loss upstream."""
@@ -278,10 +274,10 @@ class Intake:
             self._shed[source, loss.epoch] += loss.count
             for sequence in range(loss.first_sequence, loss.first_sequence + loss.count):
                 noted = self._ledger.note(source, loss.epoch, sequence)
+                self._account.count("lost_upstream", source, noted.skipped - noted.is_late)
                 if noted.skipped:
                     gap = replace(loss, first_sequence=noted.first_skipped, count=noted.skipped)
                     self._log_loss(replace(gap, reason="lost_upstream"))
-            self._say_missing(source)
         self._log_loss(loss)
 
     def _write_loss(self, loss: Loss) -> None:

@@ -223,8 +223,8 @@ class Service:
             self._do(self._tasks.get())
         if not self._running.wait(timeout_s):
             return
-        started = time.monotonic()
         taken = self._durable.take(timeout_s)
+        started = time.monotonic()  # not to wait is no work
         self._insert(taken)
         while taken and time.monotonic() - started < INSERT_S:  # what has come meanwhile, too
             taken = self._durable.take(0.0)

@@ -25,7 +25,7 @@ from facet.commands.terminal import (
     progress,
 )
 from facet.sinks.log_file import write_recording
-from facet_protocol.messages import Envelope, Pose, Scan, ScanKind
+from facet_protocol.messages import IDENTITY, Envelope, Pose, Scan, ScanKind
 
 RIGID = 1e-3  # how far a rotation may be from one, in any element of R Rᵀ
 CLOUDS = (".ply", ".pcd")
@@ -170,7 +170,7 @@ def _require_rigid(path: Path, transforms: NDArray[np.float64]) -> None:
 
 def _at_origin(cloud: Path) -> tuple[int, Pose]:
     """Of a cloud by itself: taken when its file was written."""
-    return cloud.stat().st_mtime_ns, Pose(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]))
+    return cloud.stat().st_mtime_ns, IDENTITY
 
 
 def _pose_of(T_world_sensor: NDArray[np.float64]) -> Pose:

@@ -28,6 +28,7 @@ from facet_protocol.messages import Envelope, Loss, ProtocolError
 from facet_protocol.ros_definitions import TRANSFORMS
 from facet_protocol.topics import PREFIX, corrections_key, is_erase_topic, poses_keys, scans_key
 
+MOST_TAKEN = 1 << 15  # messages at once: each may open a channel of the log, which has 65,535
 STATIC_KEYS = ("**/tf_static", "**/tf_static/tf2_msgs::msg::dds_::TFMessage_/*")
 
 
@@ -122,11 +123,12 @@ class Inbox:
             return not was_called or self._has_enough()
 
     def take(self, max_bytes: int) -> list[Envelope]:
-        """What is there, oldest first, up to `max_bytes`."""
+        """What is there, oldest first, up to `max_bytes` and MOST_TAKEN."""
         with self._changed:
             taken: list[Waiting] = []
             num_bytes = 0
-            while self._waiting and (not taken or num_bytes < max_bytes):
+            most = min(MOST_TAKEN, len(self._waiting))
+            while len(taken) < most and (not taken or num_bytes < max_bytes):
                 taken.append(self._waiting.popleft())
                 num_bytes += taken[-1].num_bytes
             self.num_bytes -= num_bytes
