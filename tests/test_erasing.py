@@ -12,6 +12,7 @@ from typer.testing import CliRunner
 from facet import corrections, erasing
 from facet.__main__ import app
 from facet.commands.replay import replay_log
+from facet.commands.terminal import Exit
 from facet.config import Config, load_config
 from facet.mapping.mapper import Mapper
 from facet.outgoing import Outgoing
@@ -175,7 +176,8 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             "?robot=r1;sensor=": "sensor= has no value",  # not: every one
             "?robot=r1;robot=r2": "robot= comes twice, 'r1' and 'r2'",
             "?robot=r1;speed=3": "'speed=3' is no parameter of erase, which takes robot=, sensor=",
-            "?robot=r9": "nothing of r9 was erased: unknown_scan",
+            "?robot=r9": "no such scan of r9 has come, nothing was erased; there are scans of r1",
+            "?robot=r1;first=9": "no such scan of r1 has come",
         }.items():
             assert said in ask(client, COMMAND + parameters)
         assert service.account["scans_erased"] == 0
@@ -199,9 +201,10 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     assert replayed.model()["digest"] == model["digest"]
     assert replayed.model()["planes"] == model["planes"]
     result = CliRunner().invoke(app, ["info", str(tmp_path)])
-    said = "0 corrections (of none), 3 erasures: 2 applied, 1 unknown_scan; 3 scans moved or erased"
+    said = "0 corrections (of none), 2 erasures: 2 applied; 3 scans moved or erased"
     assert said in " ".join(result.output.split())
-    assert sum(topics.is_erase_topic(e.key) for e in Recording([tmp_path])) == 3
+    assert sum(topics.is_erase_topic(e.key) for e in Recording([tmp_path])) == 2
+    assert replayed.exit_code is Exit.CLEAN  # a name typed wrong is not in the log
     assert (
         resume(
             load_config(None, {"record.directory": tmp_path, "mapping.voxel_m": 0.1}),

@@ -37,6 +37,7 @@ from facet_protocol.codec import decode
 from facet_protocol.messages import (
     Corrected,
     Envelope,
+    Erase,
     ProtocolError,
     ResolvedPose,
     Scan,
@@ -199,6 +200,10 @@ class Admission:
     def num_correcting(self) -> int:
         """Corrections that wait for their points."""
         return len(self.corrections)
+
+    def has_come(self, erase: Erase) -> bool:
+        """Whether any scan has that an erasure names."""
+        return next(self._firsts.of(erase), None) is not None
 
     def go_on(self) -> Sequence[Moved]:
         """Corrections whose points have come."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from typing import Any
 
@@ -24,9 +24,13 @@ MAX_NUMBER = {"epoch": (1 << 32) - 1, "first": (1 << 64) - 1, "last": (1 << 64) 
 class Erasing:
     """Asks on one thread; as a sink it hears on the mapper's what became of it."""
 
-    def __init__(self, log: Sink, outgoing: Outgoing, account: Account) -> None:
-        """`log` takes it as an input."""
+    def __init__(
+        self, log: Sink, outgoing: Outgoing, account: Account, has_come: Callable[[Erase], bool]
+    ) -> None:
+        """`log` takes it as an input, unless nothing that it names `has_come`: a name typed wrong
+        is no part of what the map is made of."""
         self._log, self._outgoing, self._account = log, outgoing, account
+        self._has_come = has_come
         self._waiting: dict[tuple[str, int], Future[Corrected]] = {}  # by robot and stamp
         self._lock = threading.Lock()
 
@@ -36,6 +40,10 @@ class Erasing:
         Raises CommandError: nothing was erased, or it is not done yet.
         """
         erase = _erase_of(parameters)
+        if not self._has_come(erase):
+            robots = sorted({source.partition("/")[0] for source in self._account.sources()})
+            text = f"no such scan of {erase.robot} has come, nothing was erased; there are scans of"
+            raise CommandError(f"{text} {', '.join(robots) or 'nobody'}")
         stamp_ns = time.time_ns()
         topic = topics.erase_topic(erase.robot)
         envelope, _ = self._outgoing.address(topic, erase, stamp_ns, stamp_ns)

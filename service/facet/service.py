@@ -38,7 +38,7 @@ from facet.sinks.snapshots import Snapshots
 from facet.sources.live import Inbox, LiveSource
 from facet.sources.naming import source_of
 from facet.status import Account
-from facet_protocol.messages import Envelope
+from facet_protocol.messages import Envelope, Erase
 
 logger = logging.getLogger(__name__)
 
@@ -81,9 +81,7 @@ class Service:
         )
         self._durable = DurableQueue(config.queue.max_bytes)
         self._past = resumed.admission.past if resumed else Past(dialects_of(config.robots))
-        self._reading = ThreadPoolExecutor(
-            1, thread_name_prefix="past"
-        )  # of the log, for corrections
+        self._reading = ThreadPoolExecutor(1, "past")  # of the log, for corrections
         self._outgoing = Outgoing(config.map.id, config.map.frame, time.time_ns)
         self.recorder = _recorder(config, mapper)
         self._intake = Intake(
@@ -97,7 +95,7 @@ class Service:
             exit_on_failure=config.record.on_full == "exit",
             past=self._past,
         )
-        self._erasing = Erasing(self._intake, self._outgoing, self.account)
+        self._erasing = Erasing(self._intake, self._outgoing, self.account, self._has_come)
         self._position: LogPosition | None = None  # all before it in the log is in the map
         self._newest: Newest = {}
         self._tasks: SimpleQueue[Task] = SimpleQueue()
@@ -353,6 +351,9 @@ class Service:
         model, tiles = self._on_mapper(lambda: (self._model(), self._mapper.points()))
         FORMATS[name](model, tiles, path)
         return {"path": str(path), "planes": len(model["planes"])}
+
+    def _has_come(self, erase: Erase) -> bool:
+        return bool(self._on_mapper(lambda: self._admission.has_come(erase)))
 
     def _on_mapper(self, run: Callable[[], Any]) -> Any:
         """The result of `run`, on the thread that owns the map, between two updates."""

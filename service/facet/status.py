@@ -124,9 +124,9 @@ class Account:
         with self._lock:
             return sorted(self._sources)
 
-    def set_counter(self, name: str, value: int, source: str = "") -> None:
+    def set_counter(self, name: str, value: int) -> None:
         with self._lock:
-            self._counters[f"{name}[{self._known(source)}]" if source else name] = value
+            self._counters[name] = value
 
     def gauge(self, name: str, value: float, source: str = "") -> None:
         """Set a gauge; one of a source is kept under the source's name."""
