@@ -117,7 +117,7 @@ def forged(header: bytes, body: bytes = b"", version: int = FORMAT) -> bytes:
 @pytest.mark.parametrize(
     ("data", "reason"),
     [
-        (forged(b"{}", version=FORMAT + 1), "its format is 3"),
+        (forged(b"{}", version=FORMAT + 1), "its format is 2"),
         (forged(b"{"), "no sense"),
         (forged(b"[]"), "no sense"),
         (forged(b"{}"), "no sense"),

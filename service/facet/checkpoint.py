@@ -28,7 +28,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAGIC = b"FACETCP\n"
-FORMAT = 2  # 1: of a line scan's beams every one was followed
+FORMAT = 1
 SUFFIX = ".checkpoint"
 ALIGNMENT = 64
 MAX_HEADER_BYTES = 64 << 20

@@ -14,8 +14,7 @@ from facet.mapping.settings import TICKS
 CELL = 4  # voxels per cell edge
 SHIFT = 12  # ticks to cells: 2^12 = CELL * TICKS
 IN_BLOCK = SHIFT + 3  # ticks to blocks of 8 cells
-CLOUD_BEAMS, LINE_BEAMS = 8, 2  # of a cloud's beams, and of a line scan's, one in so many, a power
-# of two, is followed, by a hash of its end: by 4 the office keeps all its openings, by 8 windows go
+BEAMS_OF = 8  # of a cloud's beams one in so many, a power of two, is followed: by a hash of its end
 FAR = np.int64(1) << 62  # an axis whose last cell is reached goes no farther
 FIRST_BLOCKS = 1024  # capacity to begin with
 
@@ -92,15 +91,15 @@ def _blocks_apart(a, b):  # type: ignore[no-untyped-def]
 def _pass_all(  # type: ignore[no-untyped-def]
     table, counts, keys, passed, num_blocks, scans, points, starts, start, sign, ends
 ):
-    """Follow the chosen beams from `start` on, those of scans (S,) with (sensors, pose_hashes, one
-    beam in how many of a cloud's and of a line's) beginning at starts (S + 1,). passed: when blocks
-    were passed last (B,), and what time it is. Returns (next beam, number of blocks)."""
-    sensors, pose_hashes, thin = scans
+    """Follow the chosen beams from `start` on, those of scans (S,) with (sensors, pose_hashes)
+    beginning at starts (S + 1,). passed: when blocks were passed last (B,), and what time it is.
+    Returns (next beam, number of blocks)."""
+    sensors, pose_hashes = scans
     scan, every = -1, 1
     for p in range(start, points.shape[0]):
         while p >= starts[scan + 1]:
             scan += 1
-            every = thin[0] if pose_hashes[scan] < 0 else thin[1]
+            every = BEAMS_OF if pose_hashes[scan] < 0 else 1
         sensor = sensors[scan]
         mixed = hash_key(
             points[p, 0] * 73856093 ^ points[p, 1] * 19349663 ^ points[p, 2] * 83492791
@@ -149,10 +148,8 @@ def blocks_of(points):  # type: ignore[no-untyped-def]
 class FreeSpace:
     """Beam counts by cell of 4 voxels, in dense blocks of 8^3 cells."""
 
-    def __init__(
-        self, memory: Memory | None = None, thin: tuple[int, int] = (CLOUD_BEAMS, LINE_BEAMS)
-    ) -> None:
-        self._memory, self._thin = memory or Heap(), thin
+    def __init__(self, memory: Memory | None = None) -> None:
+        self._memory = memory or Heap()
         self._keys = np.zeros(FIRST_BLOCKS, np.int64)
         self._counts = self._memory.grown(np.zeros((0, 512), np.int32), 0, FIRST_BLOCKS)
         self._table = rehash(self._keys, 0, 4 * FIRST_BLOCKS)
@@ -204,8 +201,7 @@ class FreeSpace:
         return keys[order], self._counts[block, local][order]
 
     def _apply(self, ticks: Ticks, sign: int) -> None:
-        scans = ticks.sensors, ticks.pose_hashes, self._thin
-        passed = self._passed, self.now
+        scans, passed = (ticks.sensors, ticks.pose_hashes), (self._passed, self.now)
         hits, empty = (ticks.points, ticks.starts, True), (ticks.beams, ticks.beam_starts, False)
         for points, starts, ends in (hits, empty):
             done = 0
