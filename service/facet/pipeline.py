@@ -190,10 +190,10 @@ class Pipeline:
 
     def _note(self, admitted: Admitted) -> None:
         """It is in the map."""
-        envelope, scan = admitted.envelope, admitted.scan
-        previous = self._applied.get(scan.source)
+        envelope, scan, source = admitted.envelope, admitted.scan, admitted.scan.source
+        previous = self._applied.get(source)
         num_scans = (previous.num_scans if previous else 0) + 1
-        self._applied[scan.source] = Applied(envelope, scan, num_scans)
+        self._applied[source] = Applied(envelope, scan, num_scans)
         self.is_stale = True
         self._emit(((envelope, scan),))
 

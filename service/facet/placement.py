@@ -127,6 +127,8 @@ class Placement:
 
     def _posed(self, envelope: Envelope, scan: Scan, *, is_rival: bool, is_found: bool) -> Scan:
         """With its pose, or the one that a correction gave its number; what was found is noted."""
+        if not (is_rival or is_found):
+            return scan
         number = Number(scan.source, envelope.epoch, envelope.sequence)
         corrected = self._trajectories.corrected(*number) if is_rival else None
         if corrected is not None:

@@ -50,9 +50,11 @@ class Plausibility:
 
     def take(self, scan: Scan) -> None:
         """It is in the map: the next is compared with it."""
-        last = self._last.get(scan.source)
-        newest_ns = max(scan.stamp_ns, last.stamp_ns) if last is not None else scan.stamp_ns
-        self._last[scan.source] = _Last(newest_ns, scan.pose)
+        source, newest_ns = scan.source, scan.stamp_ns
+        last = self._last.get(source)
+        if last is not None and last.stamp_ns > newest_ns:
+            newest_ns = last.stamp_ns
+        self._last[source] = _Last(newest_ns, scan.pose)
 
     def freeze(self) -> dict[str, NDArray[Any]]:
         """What the next scans are compared with, for a checkpoint."""

@@ -83,10 +83,12 @@ def is_correction(envelope: Envelope) -> bool:
 def is_input(envelope: Envelope) -> bool:
     """Whether the map is made of it: a scan, or what says where its sensor is, or was."""
     nature = _nature(envelope.key, envelope.schema)
-    if is_scan(envelope) or nature.is_correction:
+    if nature.is_correction:
         return True
     if envelope.is_derived or nature.is_own:
         return False
+    if nature.is_scan:
+        return True
     if envelope.schema in TRANSFORM_SCHEMAS:
         return True
     return envelope.schema in POSE_SCHEMAS and bool(pose_frame(envelope))
