@@ -176,7 +176,7 @@ def test_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
             "?robot=r1;sensor=": "sensor= has no value",  # not: every one
             "?robot=r1;robot=r2": "robot= comes twice, 'r1' and 'r2'",
             "?robot=r1;speed=3": "'speed=3' is no parameter of erase, which takes robot=, sensor=",
-            "?robot=r9": "no such scan of r9 has come, nothing was erased; there are scans of r1",
+            "?robot=r9": "of r9 has come, nothing was erased; heard since the start: r1",
             "?robot=r1;first=9": "no such scan of r1 has come",
         }.items():
             assert said in ask(client, COMMAND + parameters)

@@ -42,8 +42,9 @@ class Erasing:
         erase = _erase_of(parameters)
         if not self._has_come(erase):
             robots = sorted({source.partition("/")[0] for source in self._account.sources()})
-            text = f"no such scan of {erase.robot} has come, nothing was erased; there are scans of"
-            raise CommandError(f"{text} {', '.join(robots) or 'nobody'}")
+            text = f"no such scan of {erase.robot} has come, nothing was erased"
+            heard = f"; heard since the start: {', '.join(robots)}" if robots else ""
+            raise CommandError(text + heard)
         stamp_ns = time.time_ns()
         topic = topics.erase_topic(erase.robot)
         envelope, _ = self._outgoing.address(topic, erase, stamp_ns, stamp_ns)
