@@ -187,7 +187,8 @@ class Mapper:
         self._bends.forget(stirred)
         done("tiles")
         self._table = self._tabulator.tabulate(self._tiles.tiles)
-        self._planes = group_planes(self._table, limit, self.settings, self._bends.flat)
+        if stirred:  # else points came to the same voxels: what is grouped is as it was
+            self._planes = group_planes(self._table, limit, self.settings, self._bends.flat)
         points = fit_points(self._table, self._planes, self.settings.voxel_m)
         ends = find_ends(self._table, self._planes, self._bends.bent, points, self.settings)
         done("planes")
