@@ -1,4 +1,4 @@
-"""Planes: the paper's four stages, run whole over the tile-planes at every update (Table 3).
+"""Planes: the paper's four stages, run whole over the tile-planes whenever one changed (Table 3).
 
 Local normals and patches have made tile-planes (stage 1). Here similar ones merge where they touch
 (stage 2), the detail level drops what holds too little (stage 3), and what is left is consolidated:
